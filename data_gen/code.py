@@ -1,7 +1,7 @@
 """The code that a render runs. Its hash is part of the key of cached stacks, so a change of the code makes new stacks.
 
-The files are found by following imports, anywhere in a file, from the sampler's own module and from
-``data_gen.render``, which all samplers share. No module is imported for this, so Mitsuba need not be installed.
+Starting from the sampler's module and from ``data_gen.render``, which all samplers share, all imports are followed,
+including those inside functions. The files are only read and not imported, so Mitsuba need not be installed.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from data_gen.samplers import SAMPLERS
 from ngpt.system.source import code_text, imports
 
 ROOT = Path(__file__).parent
-# The registry imports the entries of all samplers, but a render runs only the entry of its sampler's own family.
+# ``data_gen.samplers`` imports the registration modules (``about.py``) of all samplers. It is not followed, because a
+# render depends only on the ``about.py`` of its own sampler's package, which is added separately.
 _REGISTRY, _MACHINERY = "data_gen.samplers", "data_gen.samplers.registry"
-# The package's ``__init__`` only re-exports names of other modules.
+# The ``__init__`` of this package only re-exports names of other modules, so it is not followed.
 _FACE = "data_gen"
 # Modules of the built-in scenes. They are left out, because a scene has its own key.
 _BUILT_IN = ("data_gen.scenes.builtin", "data_gen.scenes.grids")
 
 
 def code(sampler: str) -> str:
-    """SHA-256 of the files that a render by the sampler runs, without comments and docstrings.
+    """SHA-256 of the files that a render with the sampler runs, without their comments and docstrings.
 
     For "auto" these are the files of all samplers that it may choose. For an unknown name they are the files that all
     samplers share.
@@ -39,7 +40,7 @@ def scene_code(name: str) -> str:
 
 
 def reached(sampler: str) -> list[str]:
-    """The sorted names of the modules that a render by the sampler runs, in data_gen and in the sampler's package."""
+    """The sorted names of the modules in data_gen and in the sampler's package that a render with the sampler runs."""
     entries = [SAMPLERS[sampler]] if sampler in SAMPLERS else [s for s in SAMPLERS.values() if s.rank]
     modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and isinstance(entry.module, str)]
     queue, found = ["data_gen.render", _MACHINERY, *modules, *filter(None, map(_entries_of, modules))], set()
@@ -54,17 +55,20 @@ def reached(sampler: str) -> list[str]:
 
 
 def _entries_of(module: str) -> str | None:
-    """The module with a sampler's entry: the ``about`` of its family."""
+    """The module that registers a sampler: the nearest ``about.py`` in the packages above ``module``, or None."""
     while (module := module.rpartition(".")[0]) not in ("", _REGISTRY):
         if _file(about := f"{module}.about").is_file():
             return about
     return None
 
 
-# Cached by the time of the last change of the file
+# ``changed``, the time of the file's last change, is only there so that a changed file is read again.
 @lru_cache(maxsize=1024)
 def _named(file: Path, changed: int, homes: frozenset[str]) -> frozenset[str]:
-    """All names of modules in the packages ``homes`` that a file may import, and of the packages that contain them."""
+    """The names of everything that a file imports from the packages ``homes``, and of all packages above these.
+
+    Some of the names may be functions or classes and not modules.
+    """
     parts = [name.split(".") for name in imports(file) if name.partition(".")[0] in homes]
     return frozenset(".".join(words[: i + 1]) for words in parts for i in range(len(words)))
 

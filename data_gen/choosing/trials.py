@@ -1,14 +1,16 @@
 """Trials of samplers on a scene: small stacks, the seconds of a sample, and the error of an image without a reference.
 
-The error of an image x, with its bias, is the mean of (x - a)(x - b) / (m² + 1e-3). Here a and b are two images that
-are independent of x and of each other, so their noise cancels in the mean, as in ``ngpt.measure.metrics``. They are
-made of primals of the sampler's other stacks and of all other unbiased samplers. The difference between two
-reconstructions would not show the error: light that a sampler finds in one pixel of a thousand is an outlier, which a
-method removes from both.
+The error of an image x, including its bias, is estimated as the mean of (x - a)(x - b) / (m² + 1e-3), where m is a
+local mean of the scene's light. The images a and b are independent of x and of each other, so their noise cancels in
+the mean, as in ``ngpt.measure.metrics``. They are made from the primals of the sampler's other stacks and of all other
+unbiased samplers. Comparing two reconstructions from the same sampler would hide part of the error. If the sampler
+finds some light in only one pixel of a thousand, the reconstruction method removes it as an outlier from both images,
+so both lack it and they agree.
 
 The time of a sample is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
-favours no sampler. Users give wall seconds. One factor for all trials converts processor seconds to wall seconds: the
-sum of the wall seconds of one sample of each trial, divided by the sum of their processor seconds.
+favours no sampler. But users state their time budget in wall-clock seconds. One factor for all trials converts
+processor seconds to wall-clock seconds: the wall-clock seconds of one sample, summed over all trials, divided by the
+sum of their processor seconds.
 """
 
 from __future__ import annotations
@@ -31,39 +33,43 @@ from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Samples per pixel of each stack of a trial; a sampler with batches takes at least two batches
+# Samples per pixel of each stack of a trial. A sampler whose samples come in batches takes at least two batches.
 SPP = 8
-# The most pixels of a pilot's image; and the least, below which the choice would be chance
+# Largest image, in pixels, for the trial renders (the pilot). Scenes with fewer pixels than the second number get no
+# pilot, because its result would be mostly random.
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
-# Seeds that users are unlikely to take
+# The seeds of trials begin here, because users are unlikely to take such large seeds
 SEED = 0x9E3779B9
 
 
 @dataclass(frozen=True)
 class Trial:
     stacks: list[GradientStack]  # four, with the same number of samples each
-    seconds: float  # of one sample of the whole image
-    # The same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
+    seconds: float  # wall-clock seconds of one sample per pixel of the whole image
+    # The same in processor seconds, summed over all cores; 0 if not known, or if a graphics card renders
     processor: float = 0.0
 
 
 @dataclass(frozen=True)
 class Pilot:
-    """The clock of trials, the functions that are called while they go on, and whether they share no tails."""
+    """How trials are run: the clock, callbacks for progress and for stopping, and whether renders must be unbiased
+    (paths then share no cached light).
+    """
 
     clock: Callable[[], float] = time.perf_counter
-    said: Callable[[str], None] = lambda line: None  # called with what is tried
-    stop: Callable[[], bool] = lambda: False  # whether to end there
+    said: Callable[[str], None] = lambda line: None  # called with a line for the user before each trial
+    stop: Callable[[], bool] = lambda: False  # asked between renders; True ends the trials
     unbiased: bool = False  # as in ``data_gen.render.render_stack``
 
 
 def candidates(scene: mi.Scene, biased: bool = False, gradients: bool = False) -> list[str]:
     """Samplers that could render the scene: the one that its description suggests, then the ones to compare it with.
 
-    If the first is the default (``SIMPLE``), the others are samplers that find light which it hardly finds. ``biased``
-    adds biased samplers at the end. With ``gradients`` the only candidate is the sampler that renders gradients.
+    If the suggestion is the default (``SIMPLE``), it is only compared with samplers that find light which the default
+    hardly finds. ``biased`` adds biased samplers at the end. With ``gradients`` the only candidate is the sampler that
+    renders gradients.
     """
     facts = scene_facts(scene)
     first, method, _ = described(facts, gradients)
@@ -80,11 +86,11 @@ def try_all(
     first: float = math.inf,
     pilot: Pilot = Pilot(),
 ) -> dict[str, Trial]:
-    """Trials of the samplers that can render the scene, by name.
+    """The trials of the samplers that can render the scene, by name of sampler.
 
-    ``budget`` returns the seconds of the clock that all trials may take together; it is called with the trials so far.
-    A trial whose compilation and render would not fit into the rest is left out. The first sampler has a budget of its
-    own, ``first``, and is always compiled.
+    ``budget`` is called with the trials so far, and returns the seconds that all trials may take together. A trial
+    whose compilation and render would not fit into the remaining time is left out. The first sampler has its own time
+    budget, ``first``, and is always compiled.
     """
     clock, stop = pilot.clock, pilot.stop
     start, slow = clock(), 1.0
@@ -94,13 +100,13 @@ def try_all(
         compiles = SAMPLERS[name].compiles
         if i and slow * compiles > rest:
             continue
-        pilot.said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
+        pilot.said(f"pilot: trying '{name}'; compiling its kernels may take {slow * compiles:.0f} s")
         begins = clock()
         trial, compiled = try_out(scene, name, rest, pilot)
         if stop():
             break
-        # A scene of many materials, or a busy machine, also slows down the next trial. If the kernels were cached by
-        # another render, the time shows nothing.
+        # A scene of many materials, or a busy machine, also slows down the next trial. If the kernels were already
+        # cached, the measured time is short and says nothing about the machine, so `slow` never falls.
         slow = max(slow, (compiled - begins) / compiles)
         if trial is not None:
             trials[name] = trial
@@ -108,12 +114,15 @@ def try_all(
 
 
 def seed_of(sampler: str) -> int:
-    """The first of the eight seeds of a sampler's trials: by its name, so that no other sampler changes them."""
+    """The first of the eight consecutive seeds that are reserved for a sampler's trial.
+
+    It is derived from the sampler's name, so it does not depend on which other samplers are tried.
+    """
     return SEED + 8 * zlib.crc32(sampler.encode())
 
 
 def by_processor(trials: dict[str, Trial]) -> dict[str, Trial]:
-    """Rescales wall seconds to the ratios of processor seconds; their sum stays."""
+    """Makes the seconds of trials proportional to their processor seconds, without changing the sum of the seconds."""
     if not trials or not all(trial.processor for trial in trials.values()):
         return trials
     wall = sum(trial.seconds for trial in trials.values()) / sum(trial.processor for trial in trials.values())
@@ -131,8 +140,7 @@ def try_out(
     clock, unbiased, begins = pilot.clock, pilot.unbiased, pilot.clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), seed_of(sampler)
-    # The time that a render takes to begin is not part of the time of a sample. A render of another length separates
-    # the two.
+    # Timing a second render with a different number of samples separates start-up time from time per sample.
     other = batch or 2 * SPP
     try:
         render_stack(scene, 1, seed, sampler, unbiased=unbiased)
@@ -140,7 +148,7 @@ def try_out(
         return None, clock()
     compiled = clock()
     if compiled - begins > limit / 2:
-        # Each of the stacks would take a good part of that time again.
+        # Each of the stacks would take a large part of the time of this first render again.
         return None, compiled
 
     def timed(n: int, seed: int) -> tuple[GradientStack, tuple[float, float]]:
@@ -169,11 +177,11 @@ def try_out(
 
 @dataclass(frozen=True)
 class Witnesses:
-    """The images by which the images of each sampler are judged."""
+    """The images that the images of each sampler are compared with, to estimate their errors."""
 
-    primals: dict[str, list[np.ndarray]]  # four of each sampler, by name
-    noise: dict[str, float]  # of a single primal, by name of sampler
-    scale: np.ndarray  # errors are relative to it: the mean of the primals of all samplers, weighted by 1 / noise
+    primals: dict[str, list[np.ndarray]]  # four images of each sampler, by name of sampler
+    noise: dict[str, float]  # the relMSE of a single primal, by name of sampler
+    scale: np.ndarray  # the mean of all primals, weighted by 1 / noise; errors are relative to this image
 
     @classmethod
     def of(cls, trials: dict[str, Trial]) -> Witnesses:
@@ -185,7 +193,8 @@ class Witnesses:
 
     def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
         """Two independent images from all unbiased samplers. Of ``sampler`` itself, only one ``half`` of its stacks is
-        used. If all samplers are biased, all are used."""
+        used. The biased samplers are used too if every sampler is biased.
+        """
         names = [*(n for n in self.primals if n != sampler), sampler]
         fair = [n for n in names if not SAMPLERS[n].biased] or names
         noise = {n: self.noise[n] if n == sampler else self.noise[n] / 2 for n in fair}
@@ -198,10 +207,10 @@ class Witnesses:
         return side(0), side(1)
 
     def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
-        """The error of images by ``sampler``: ``halves`` holds some images from each half of its stacks.
+        """The mean error of images by ``sampler``. ``halves`` holds one or two images from each half of its stacks.
 
-        It is at least the noise by which the images of one half differ from each other. This bound holds even if the
-        noise of the other samplers hides the rest.
+        The result is never less than the noise measured between the two images of a half (or between the halves, if
+        each has one image). So it cannot be too small where the other samplers are too noisy to reveal the error.
         """
         judged = [
             error_of(image, *self.against(sampler, 1 - half), self.scale)
@@ -212,7 +221,7 @@ class Witnesses:
         return max(statistics.mean(judged), statistics.mean(noise_of(a, b, self.scale) for a, b in pairs), 1e-9)
 
     def doubt(self, sampler: str, image: np.ndarray) -> float:
-        """The standard error of the error of an ``image`` of the first half."""
+        """The standard error of the estimated error of an ``image`` from the first half of the stacks."""
         a, b = self.against(sampler, 1)
         values = ((image - a) * (image - b) / _denominator(self.scale)).mean(axis=-1)
         return float(values.std()) / math.sqrt(values.size)
@@ -225,17 +234,23 @@ def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarra
 
 
 def noise_of(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
-    """The relMSE of each of two independent unbiased images, by their difference; trimmed as the metric is."""
+    """The relMSE of one of two independent, unbiased, equally noisy images, estimated from their difference.
+
+    The worst pixels are left out, as in the metric.
+    """
     errors = np.square(a - b) / 2 / _denominator(scale)
     return trimmed_mean(errors, errors, _TRIM)
 
 
 def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
-    """The relMSE of an image by two independent unbiased ones; trimmed as the metric is."""
+    """The relMSE of image x, estimated with the help of two independent unbiased images a and b.
+
+    The worst pixels are left out, as in the metric.
+    """
     under = _denominator(scale)
     return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:
-    """m² + 1e-3, where m is the mean over 7x7 pixels of an image that has some noise itself."""
+    """m² + 1e-3. Here m is ``scale`` averaged over 7x7 pixels, because ``scale`` itself is noisy."""
     return ndimage.uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON

@@ -1,9 +1,10 @@
 """Holes: surfaces that let a part of the light pass straight through, such as masks and thin panes.
 
-A path that meets a hole passes it by chance, at a vertex of its own (``vertex.NULL``). A ray toward an emitter goes
-straight on and is weakened by T, as in Mitsuba's ``volpath``. Both techniques find the same light, so the density of a
-direction is the same behind a hole as before it. Each hole counts in ``max_depth``, as in ``path``, whichever technique
-passes it.
+Where a path meets a hole, random BSDF sampling decides whether it passes, and this counts as a separate vertex
+(``vertex.NULL``). A shadow ray goes straight through all holes, and its light is multiplied by their transmittance T,
+as in Mitsuba's ``volpath``. Both techniques find the same light through a hole. For their MIS weights, a path keeps the
+point and the density with which its direction was last sampled, however many holes it has passed since. Each hole
+counts in ``max_depth``, as in ``path``, whichever technique passes it.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ from data_gen.paths.vertex import NULL, SMOOTH, ByMaterial, dr_number
 from data_gen.scenes.facts import shapes_of
 from data_gen.scenes.integrators import objects_in
 
-# Materials for which the share of light that goes straight through is known, if it is known for all materials inside
+# Materials that report the share of light that goes straight through, if all materials nested in them do
 _KNOWN = ("MaskBSDF", "Null", "ThinDielectric", "BlendBSDF")
 
 
 @dataclass
 class _Straight:
-    """The point ``o`` from which a path has gone straight on, through holes if there are any."""
+    """A straight piece of a path that begins at the point ``o``, and may pass through holes."""
 
     o: mi.Point3f
 
     def seen_by(self, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-        """``x`` moved to ``o``, to evaluate the density of sampling an emitter from there."""
+        """``x`` moved to ``o``, to evaluate the density with which an emitter is sampled from ``o``."""
         there = mi.SurfaceInteraction3f(x)
         there.p = mi.Point3f(self.o)
         return there
@@ -37,8 +38,9 @@ class _Straight:
 
 @dataclass
 class Aim(_Straight):
-    """A straight way from ``o``, whose direction was sampled with density ``p``. ``p`` is infinite if emitters cannot
-    be sampled from ``o``: at the camera and at mirrors.
+    """A straight piece whose direction was sampled at ``o`` with density ``p``.
+
+    ``p`` is infinite where emitters cannot be sampled from ``o``: at the camera and at mirrors.
     """
 
     p: mi.Float
@@ -48,7 +50,11 @@ class Aim(_Straight):
         return cls(mi.Point3f(o), dr.full(mi.Float, dr.inf, dr.width(o)))
 
     def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f, kind: mi.UInt32, p: mi.Float) -> Aim:
-        """The aim behind vertex ``x``. The event there had this ``kind`` and density ``p``, or ``passed`` a hole."""
+        """The aim behind vertex ``x``.
+
+        ``passed``: whether the path went straight through a hole at ``x``, so that the old aim stays. Otherwise the
+        event had this ``kind`` and density ``p``.
+        """
         return Aim(
             dr.select(passed, self.o, x.p), dr.select(passed, self.p, dr.select(kind == SMOOTH, p, mi.Float(dr.inf)))
         )
@@ -56,12 +62,12 @@ class Aim(_Straight):
 
 @dataclass
 class Edge(_Straight):
-    """An edge of a path from the camera or from a lamp. It may lead through several holes."""
+    """An edge of a path that was traced from the camera or from a lamp. The edge may pass through several holes."""
 
-    first: mi.Bool  # whether it begins at the camera or at a lamp
+    first: mi.Bool  # whether this is the path's first edge, which begins at the camera or lamp and not at a surface
 
     def behind(self, passed: mi.Bool, x: mi.SurfaceInteraction3f) -> Edge:
-        """The edge behind vertex ``x``. ``passed``: the path has passed a hole there."""
+        """The edge behind vertex ``x``. ``passed``: whether the path went straight through a hole at ``x``."""
         return Edge(dr.select(passed, self.o, x.p), self.first & passed)
 
     def length2(self, x: mi.SurfaceInteraction3f) -> mi.Float:
@@ -81,7 +87,7 @@ class Holes:
         return (kind == NULL) & self.known.of(bsdf)[1]
 
     def share(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
-        """The share that goes straight through at ``si``; 0 where nothing does, or where it is unknown."""
+        """The share of light that goes straight through at ``si``; 0 where it is unknown."""
         bsdf = si.bsdf()
         listed, known = self.known.of(bsdf, active)
         known &= listed
@@ -89,7 +95,7 @@ class Holes:
 
     @classmethod
     def of(cls, scene: mi.Scene, passed: Callable[[mi.Shape], bool] = lambda shape: False) -> Holes | None:
-        """The holes of a scene, or None if it has none. Shapes for which ``passed`` is true are left out."""
+        """The holes of a scene, or None if the scene has no holes. Shapes for which ``passed`` is true are left out."""
         bsdfs = (shape.bsdf() for shape in shapes_of(scene) if not passed(shape))
         some = [bsdf for bsdf in bsdfs if bsdf is not None and has_holes(bsdf) and knows(bsdf)]
         return cls(some) if some else None
@@ -97,7 +103,11 @@ class Holes:
     def behind(
         self, si: mi.SurfaceInteraction3f, T: mi.Spectrum, left: mi.UInt32, going: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32, mi.Bool]:
-        """``T``, the number of holes ``left`` and which rays are still ``going``, behind the surface at ``si``."""
+        """Updates three values at the surface ``si``.
+
+        They are the transmittance ``T``, ``left`` (how many more holes may be passed) and ``going`` (whether the ray
+        continues).
+        """
         T = dr.select(going, mi.Spectrum(T * dr.select(left > 0, self.share(si, going), 0)), T)
         going = going & (dr.max(T) > 0)
         return T, dr.select(going, left - 1, left), going
@@ -106,7 +116,7 @@ class Holes:
     def transmittance(
         self, scene, ray: mi.Ray3f, target: mi.Point3f, most, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.UInt32]:
-        """T along ``ray`` to the ``target``, and the number of holes on it. T is 0 if there are more than ``most``."""
+        """T along ``ray`` to the ``target``, and the number of holes on it. T is 0 with more than ``most`` holes."""
         ray, left, going = mi.Ray3f(ray), mi.UInt32(most), mi.Bool(active)
         T = dr.select(active, mi.Spectrum(1), 0)
         while dr.hint(going, label="holes"):
@@ -123,9 +133,12 @@ class Holes:
     ) -> tuple[mi.Spectrum, mi.UInt32]:
         """As ``transmittance()`` from ``si`` to a camera from which lamps are hidden.
 
-        There a lamp blocks light only if a hole is between the lamp and the camera."""
+        Such a camera sees straight through a lamp that it would see directly. But a lamp seen through a hole is visible
+        as usual, and blocks the light behind it.
+        """
         ray, left, going = si.spawn_ray_to(target), mi.UInt32(most), mi.Bool(active)
-        # T as a surface sees it, and T as the camera sees it
+        # T with lamps blocking light as usual, and T for the camera, which sees straight through lamps up to the hole
+        # nearest to it
         T, seen = dr.select(active, mi.Spectrum(1), 0), dr.select(active & ~_on_lamp(si, scene), mi.Spectrum(1), 0)
         left_there = mi.UInt32(left)
         while dr.hint(going, label="holes"):

@@ -17,18 +17,21 @@ from ngpt.errors import stop_if_interrupted
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# Parameters of a film whose values are in arrays of the camera and not in kernels
+# Parameters of the film that kernels read from arrays of the camera, so a change of them needs no new kernel
 _IN_ARRAYS = ("film.size", "film.crop_offset")
 
 
 class Made:
-    """The newest sampler of each name. The camera may move between renders; any other change needs a new one."""
+    """The newest sampler of each name.
+
+    A kept sampler stays valid if only the camera moves; after any other change a new sampler is made.
+    """
 
     def __init__(self) -> None:
         self._kept: dict[str, tuple[Any, SamplePass]] = {}
 
     def sampler(self, entry: Sampler, scene: mi.Scene, options: dict[str, Any]) -> SamplePass:
-        """The kept sampler if it still fits, or else what ``entry.make`` makes. ``options`` are the sampler's own."""
+        """Returns the kept sampler if it is still valid, or else a new one. ``options`` are for ``entry.make``."""
         if entry.name in self._kept:
             key, sample = self._kept[entry.name]
             if key == _key(scene, options):
@@ -36,10 +39,13 @@ class Made:
         return entry.make(scene, **options)
 
     def keep(self, entry: Sampler, scene: mi.Scene, options: dict[str, Any], sample: SamplePass) -> None:
-        """Keeps a sampler after a render. Samplers that depend on the view, or remember passes, are not kept.
+        """Keeps a sampler after a render.
 
-        A failure here only gives a warning, since the render has all its samples. The next render makes its own
-        sampler.
+        Two kinds are not kept: samplers that choose lamps for the current view (``places``), and samplers whose pixels
+        all need the same number of samples (``even``), since they may carry state from pass to pass.
+
+        A failure here only gives a warning, since the render already has all its samples. The next render then makes a
+        new sampler.
         """
         if entry.even or "places" in options:
             return
@@ -51,7 +57,10 @@ class Made:
 
 
 def _key(scene: mi.Scene, options: dict[str, Any]) -> tuple:
-    """Values on which a recorded kernel depends, except arrays of the camera: numbers by value, arrays by identity."""
+    """All values on which a recorded kernel depends, except arrays of the camera.
+
+    Numbers are compared by value, arrays by identity.
+    """
     camera = scene.sensors()[0]
     of_scene, of_camera = map(_values, (scene, camera))
     numbers = {key: value for key, value in of_camera.items() if not leaves(value) and key not in _IN_ARRAYS}

@@ -1,23 +1,29 @@
-"""The cache: for each cell the mean light that arrives. On surfaces it is the irradiance over π, in media the mean
-radiance over all directions.
+"""The cache of light in which paths may end early. For each cell it stores the mean light that arrives there.
+
+On surfaces the mean light is the irradiance over π, in media it is the mean radiance over all directions.
 
 Cells are cubes. Cells of different size are separate, and so are cells for different directions of the surface normal.
 The *spread* of a path at a vertex is the width of the bundle of similar paths that arrive there. A path reads cells
-that are small compared to its spread. Each smooth event adds to the spread:
+that are small compared to its spread. Each *smooth* event, which is a scattering event that is not specular (no Dirac
+delta), adds to the spread:
 
-    spread = Σ t / sqrt(p |cos θ|),
+    spread = Σ t / sqrt(p |cos θ|).
 
-for steps of length t whose direction has density p and meets the surface at θ [the same area: Bekaert et al. 2003,
-"Custom path-space filtering"; Müller et al. 2021, "Real-time neural radiance caching for path tracing"].
+The sum is over the steps of the path that follow a smooth event. Here t is the length of the step, p is the density of
+its direction, and θ is the angle at which it meets the next surface. (The squared spread is the area of the bundle's
+footprint [Bekaert et al. 2003, "Custom path-space filtering"; Müller et al. 2021, "Real-time neural radiance caching
+for path tracing"].)
 
-Records belong to one of two *halves*, which come from different paths. Paths that feed a half never read light of the
-other half. Paths of the image read the mean of both. Half of the difference between the halves is a sample of the error
-of that mean: both halves have the same distribution, so this sample has the same variance as the mean. The same holds
-for covariances between cells, and for all sums of values that paths read. So a render can estimate the noise that its
-pixels share, however far the light of a record has spread.
+Special paths feed the cache: they add *records*, samples of the light at a vertex, to its cells. Each record belongs to
+one of two *halves*, which come from different paths. Paths that feed a half never read light of the other half. Paths
+of the image read the mean of both halves. Half of the difference between the halves is a sample of the error of that
+mean: both halves have the same distribution, so this sample has the same variance as the mean. The same holds for
+covariances between cells, and for all sums of values that paths read. So a render can estimate the noise that its
+pixels have in common, even where one record contributes to many pixels through other cells.
 
-Sums are integers, so they do not depend on the order of additions. ``Known`` is what paths read. It is computed from
-the sums between two rounds, and does not change within a round.
+Sums are integers, so they do not depend on the order of additions. The image is rendered in rounds. Paths feed the
+cache only between two rounds. ``Known``, which paths read, is recomputed from the sums then, and does not change during
+a round.
 """
 
 from __future__ import annotations
@@ -36,16 +42,16 @@ from data_gen.paths.streams import mixed
 from data_gen.tails.schedule import FINENESS
 from data_gen.tails.table import INSIDE, CellGrid, CellPlace, in_table, key, octahedral
 
-# MiB that the cache takes, and the least memory limit of a render that has a cache, in MiB
+# The size of the cache, and the least memory limit with which a render uses a cache; both in MiB
 MIB, LEAST_MIB = 320, 640
-# A path may end where its spread exceeds this share of the length of its way to the first rough surface.
+# A path may end where its spread exceeds this fraction of the path's length up to its first smooth event.
 NEAR = 1 / 8
 HALVES = 2
 
 
 @dataclass
 class Trail:
-    """How far a path has come: the length of its way to the first rough surface, and its spread from there on."""
+    """How far a path has come: ``reach`` is its length up to the first smooth event, and ``spread`` its spread."""
 
     reach: mi.Float
     spread: mi.Float
@@ -56,9 +62,10 @@ class Trail:
         return cls(mi.Float(first), dr.zeros(mi.Float, dr.width(first)))
 
     def on(self, x: mi.SurfaceInteraction3f, inside: mi.Bool, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
-        """The trail at the next vertex ``x``, after an event that was ``smooth`` or not, with density ``p``.
+        """The trail at the next vertex ``x``, after an event with density ``p``.
 
-        It does not change if there is no next vertex. At a vertex ``inside`` a medium the cosine is 1.
+        ``smooth`` says whether the event was not specular. The trail does not change if there is no next vertex. At a
+        vertex ``inside`` a medium the cosine is 1.
         """
         there = active & x.is_valid()
         cosine = dr.select(inside, 1, dr.abs(x.wi.z))
@@ -69,23 +76,26 @@ class Trail:
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
-# Slots of the table of cells, and the share of them that may be used
+# The number of slots in the table of cells, and the share of the slots that may be used
 CELLS, _FULL = 1 << 20, 0.5
-# A cell is trusted once each half has this number of records in it, whatever their values: see ``Cache``. Few are
-# enough, since about as many paths read a cell as there are records in it.
+# A cell is trusted once each half has this number of records in it, whatever their values: see ``Cache``. A small
+# number is enough: a cell with few records is also read by few paths, so its noise affects only a small part of the
+# image.
 LEAST = 4
-# Paths that feed the cache read only cells with LEAST_TO_FEED records in each half. With probability RENEW they make a
-# further record instead. Otherwise cells that many paths read would keep the noise of their first records.
+# Paths that feed the cache read only cells with LEAST_TO_FEED records in each half. Even then, with probability RENEW,
+# they do not end there but add another record. Without this, cells that many paths read would never get more records,
+# and would keep the noise of the first ones.
 LEAST_TO_FEED, RENEW = 16, 0.25
-# A cell is torn if the light in its two parts along an axis differs by more than TORN times their sum (at the coarsest
-# fineness) and by more than _CERTAIN standard errors, and if each part has _ENOUGH records.
+# Paths do not end in a *torn* cell, whose parts receive different light. A cell is torn if, along some axis, both
+# halves of its volume have _ENOUGH records, and their light differs by more than TORN times its sum and by more than
+# _CERTAIN standard errors. TORN is for the initial cell size; the threshold shrinks as cells get finer.
 TORN, _CERTAIN, _ENOUGH = 0.2, 2.5, 3
-# For this test the light of a record is mapped to [0, 1], and stored as an integer in units of 1 / _PARTS.
+# For this test, the light of each record is mapped to [0, 1] and stored as an integer in units of 1 / _PARTS.
 _PARTS = 4095
-# The weight of a new record, as an integer that can be halved often: see ``fade``
+# The weight of a new record, as an integer that can be halved several times: see ``fade``
 _WHOLE = 256
-# The light of a record is cut to MOST times the mean of all records so far, or to 1 / PARTS of their sum if that is
-# more. Otherwise a single bright path would leave a spot that no denoiser removes.
+# The light of a record is limited to MOST times the mean light of all records so far, or to 1 / PARTS of the sum of
+# their light if that is more. Without this limit, a single bright path would leave a spot that no denoiser removes.
 MOST, PARTS = 3000, 200
 # Sums are integers in a unit of light. The unit is chosen so that the brightest of the first records has about 2^_BITS
 # units. No record has more than 2^_MOST_BITS units.
@@ -94,11 +104,13 @@ _BITS, _MOST_BITS = 24, 40
 
 @dataclass
 class Known:
-    """What paths read. Each sort of light has four numbers for each cell in both lists:
+    """The light that paths read. ``means`` and ``differences`` have one array for each sort of light (see ``Cache``).
 
-    ``means``        the mean of the two halves, RGB; then the number of records in the half that has fewer of them
-    ``differences``  half of the difference between the two halves, RGB; then 1 if the first half says that the cell is
-                     torn, plus 2 if the second half does
+    An array holds four numbers for each cell:
+
+    ``means``        the mean of the two halves, RGB; then the number of records in the half that has fewer records
+    ``differences``  half of the difference between the two halves, RGB; then the sum of 1 if the first half's records
+                     say that the cell is torn, and 2 if the second half's records say so
     """
 
     keys: mi.UInt32
@@ -112,8 +124,8 @@ class Known:
     ) -> CellPlace:
         """The place of vertex ``x`` among the cells whose edge is at most ``spread`` / ``fineness``.
 
-        Vertices ``inside`` media share no cells with vertices on surfaces. Vertices of different ``kind`` share none
-        either.
+        Vertices ``inside`` media share no cells with vertices on surfaces. Vertices of different ``kind`` share no
+        cells with each other.
         """
         level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / self.fineness, 1e-20))))
         normal = dr.select(inside, mi.UInt32(INSIDE), octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))))
@@ -124,12 +136,14 @@ class Known:
     ) -> tuple[list[mi.Color3f], list[mi.Color3f], mi.Bool]:
         """The light of each sort at a place, a sample of its error, and whether the light is known.
 
-        It is known if each half has ``least`` records in the cell, and the cell is not torn. Paths that feed a ``half``
-        read the light of that half. All other paths (None) read the mean of both.
+        The light is known if each half has ``least`` records in the cell, and the cell is not torn. Paths that feed a
+        ``half`` read the light of that half. All other paths (None) read the mean of both halves.
 
-        The records of one half decide only whether the light of the *other* half may be read. Otherwise a half that has
-        found rare light would say that the cell is torn, and this light would be lost. If just one half says that a
-        cell is torn, a path of the image reads the light of that half every other time, and goes on the other times.
+        The records of one half decide only whether the light of the *other* half may be read. If a half judged itself,
+        finding rare light in one part of a cell would make it call the cell torn. The light would then be discarded
+        just where it was found, which is a bias. If only half A calls a cell torn, half A's light may still be read,
+        because half B allows it; half B's light may not. A path of the image then reads A's light in half of the cases,
+        chosen by a hash of the position, and in the other half continues without ending.
         """
         h, name, _ = key(place)
         slot, found = in_table(self.keys, h, name, active)
@@ -140,11 +154,11 @@ class Known:
         known = found & (means[0].w >= least) & (torn < 3)
         mean, error = ([mi.Color3f(v.x, v.y, v.z) for v in each] for each in (means, differences))
         if half is None:
-            # Every other time: a hash of the place decides.
+            # If one half calls the cell torn, the path ends in half of the cases: a hash of the position decides.
             known &= (torn == 0) | (mixed(dr.reinterpret_array(mi.UInt32, place.p.x)) & 1 == 0)
             which = torn
         else:
-            # The other half decides.
+            # The other half decides whether the cell is torn.
             known &= (torn >> (1 - half)) & 1 == 0
             which = half + 1
         sign = dr.select(which == 0, mi.Float(0), dr.select(which == 1, 1, -1))
@@ -153,12 +167,15 @@ class Known:
 
 
 class Cache:
-    """The sums of ``sorts`` sorts of light in each cell, and ``known``, their means, which paths may read.
+    """For each cell, the sums of light of each sort. ``known`` holds the means, which paths may read.
 
-    The number of a cell's records decides whether the cell is trusted, not the light in them. Where light is rare, a
-    cell that has found some looks uncertain, and a cell that has missed it looks certain. Trusting only the certain
-    cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: its two parts along an axis
-    have different light, for example because a wall goes through it. Paths do not end in such a cell.
+    ``sorts`` is their number. There are two if light of the layer ``caustic`` is stored separately, and otherwise one.
+
+    Whether a cell is trusted depends on the number of its records, and not on their light. Where light is rare, a cell
+    that has found some of the light looks uncertain, and a cell that has missed the light looks certain. Trusting only
+    the certain cells would lose light: see docs/samplers/tails.md. A *torn* cell is not trusted either: its two parts
+    along an axis receive different light, for example because a wall goes through the cell. Paths do not end in torn
+    cells.
     """
 
     def __init__(self, fineness: float, sorts: int = 1, grid: CellGrid | None = None):
@@ -166,12 +183,13 @@ class Cache:
         # For each half and cell: the sum of the weights of its records, and the weighted sums of their light
         self.weight = dr.zeros(mi.UInt32, HALVES * CELLS)
         self.sums = [dr.zeros(mi.Int64, HALVES * CELLS) for _ in range(3 * sorts)]
-        # For each half and cell: the number of records, and the sums of their light and of its square, in units of
-        # 1 / _PARTS. Each of them for all records, and for the records in the upper part along x, y and z
+        # For each half and cell: the number of records, the sum of their light, and the sum of its squares, both in
+        # units of 1 / _PARTS. Each list holds the values for all records, and for the records in the upper part of the
+        # cell along x, y and z.
         self.parts = [[dr.zeros(mi.UInt32, HALVES * CELLS) for _ in range(4)] for _ in range(3)]
         self.unit, self.full = 0.0, False
-        # For all records so far: their number, the sum of their light (the largest channel of each, in units), and how
-        # much of this light was cut
+        # For all records so far: their number, the sum of their light (the largest channel of each record, in units),
+        # and how much of this light was cut off
         self.records = self.light = self.cut = 0
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)] for _ in range(2))
         grid = grid or CellGrid.at()
@@ -179,8 +197,10 @@ class Cache:
         dr.make_opaque(self.keys, self.weight, self.sums, self.parts, means, differences)
 
     def add(self, place: CellPlace, half: mi.UInt32, values: list[mi.Float]) -> None:
-        """Adds records to their cells. ``values`` are R, G, B of each sort of light, which may be below 0. ``half`` is
-        0 or 1."""
+        """Adds records to their cells.
+
+        ``values`` are R, G and B of each sort of light, and may be below 0. ``half`` is 0 or 1.
+        """
         largest = reduce(dr.maximum, map(dr.abs, values))
         good = dr.isfinite(sum(values))
         if not self.unit:
@@ -188,7 +208,7 @@ class Cache:
             if first > 0:
                 # A smaller number may have no inverse in float32.
                 self.unit = 2.0 ** max(math.ceil(math.log2(first)) - _BITS, -126)
-        # Opaque: a literal would be compiled into the kernel, so every scene would need a new kernel.
+        # The number is opaque: as a literal it would be compiled into the kernel, so every scene would need a new one.
         scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
         brightest = dr.select(good, dr.minimum(largest * scale, 2.0**_MOST_BITS), 0)
         self.records += int(dr.count(good)[0])
@@ -208,8 +228,9 @@ class Cache:
         for each, count in zip(self.sums, counts, strict=True):
             dr.scatter_add(each, count, of_half, placed, **direct)
         dr.scatter_add(self.weight, mi.UInt32(_WHOLE), of_half, placed, **direct)
-        # The light of a record relative to the light of its cell, or to the mean of all records if the cell's is not
-        # known. It is below 1, so a very bright record counts little more than a bright one.
+        # ``part`` is the light of a record divided by the sum of this light and the usual light: the light of its cell,
+        # or the mean of all records if the light of the cell is not known. ``part`` is below 1, so a very bright record
+        # counts little more than a bright one.
         here = [dr.gather(mi.Vector4f, each, slot, placed) for each in self.known.means]
         brightest_here = sum(dr.maximum(v.x, dr.maximum(v.y, v.z)) for v in here) / self._unit_or_1()
         usual = dr.maximum(dr.select(here[0].w > 0, brightest_here, mean), 1e-20)
@@ -221,13 +242,15 @@ class Cache:
         dr.eval(self.keys, self.weight, self.sums, self.parts)
 
     def fade(self) -> None:
-        """Halves the weight of all records so far, before new paths make records that end in them.
+        """Halves the weight of all records so far.
 
-        New records repeat the noise of the cells that their paths read. Let g be the share of their light that comes
-        from there, and let the number of records double in each round. With equal weights, a round would multiply the
-        noise of the old records by (1 + g) / 2. Where light is rare, g is large, and this factor is above sqrt(1/2),
-        the factor for independent records. With half the weight the factor is (1 + 2 g) / 3, which is smaller. The own
-        noise of the records grows by 13 %. A cell keeps the weight of ``LEAST`` records, so that it is not forgotten.
+        It is called before further paths feed the cache. These paths may end in cells filled by the old records, so new
+        records repeat the noise of the cells that their paths read. Let g be the share of the new records' light that
+        comes from these cells, and let the number of records double in each round. With equal weights, a round would
+        multiply the noise of the old records by (1 + g) / 2. Where light is rare, g is large, and this factor is above
+        sqrt(1/2), the factor for independent records. With half the weight the factor is (1 + 2 g) / 3, which is
+        smaller. In exchange, the records' independent noise is 13 % higher than with equal weights. No weight is halved
+        to less than that of ``LEAST`` records, so that old records are not forgotten.
         """
         much = self.weight >= 2 * LEAST * _WHOLE
         self.sums = [dr.select(much, each >> 1, each) for each in self.sums]
@@ -242,8 +265,8 @@ class Cache:
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:
             self.full = True
-            what = "paths that come to other places do not end there; --unbiased turns the cache off"
-            _LOG.warning("the cache of tails is full (%d cells): %s", cells, what)
+            what = "where it has no cell, paths go to their end, which takes longer; --unbiased turns the cache off"
+            _LOG.warning("the light cache is full (%d cells): %s", cells, what)
         cell, unit = dr.arange(mi.UInt32, CELLS), self._unit_or_1()
         counts, weights = (
             [dr.gather(mi.UInt32, each, cell + half * CELLS) for half in range(HALVES)]
@@ -254,7 +277,7 @@ class Cache:
         torn = dr.select(dr.gather(mi.Bool, torn, cell), mi.Float(1), 0) + dr.select(
             dr.gather(mi.Bool, torn, cell + CELLS), mi.Float(2), 0
         )
-        # Frees the memory of the old values before the new ones are made.
+        # This frees the memory of the old values before the new values are made.
         self.known.means.clear()
         self.known.differences.clear()
         means, differences = ([dr.zeros(mi.Float, 4 * CELLS) for _ in range(len(self.sums) // 3)] for _ in range(2))
@@ -275,8 +298,7 @@ class Cache:
     def torn(self, fineness: float) -> mi.Bool:
         """For each half and cell: whether the half has found different light in two parts of the cell along an axis.
 
-        The finer the cells, the smaller is the difference that counts. So the light that leaks through walls vanishes
-        with the size of cells.
+        The threshold falls as cells get finer. So the light that leaks through walls goes to zero as cells shrink.
         """
         torn = mi.Bool(False)
         whole, *uppers = ([mi.Float(each[i]) for each in self.parts] for i in range(4))
@@ -292,15 +314,18 @@ class Cache:
 
 
 def _mean_and_variance(n: mi.Float, light: mi.Float, squares: mi.Float) -> tuple[mi.Float, mi.Float]:
-    """The mean of n values and the variance of that mean, from their sums in _PARTS."""
+    """The mean of n values and the variance of that mean.
+
+    They are computed from the sums of the values and of their squares, both in units of 1 / _PARTS.
+    """
     mean = light / dr.maximum(_PARTS * n, 1)
-    # At least the error of rounding
+    # The variance of the values is at least that of rounding.
     spread = dr.maximum(squares / dr.maximum(_PARTS * n, 1) - dr.square(mean), 1 / _PARTS)
     return mean, spread / dr.maximum(n - 1, 1)
 
 
 def joined(parts: Iterable[Any]) -> Any:
-    """Concatenates arrays. ``dr.concat`` would compile their widths into a new kernel each time."""
+    """Concatenates arrays. ``dr.concat`` would compile the widths of the arrays into a new kernel each time."""
     parts = list(parts)
     whole, begin = dr.empty(type(parts[0]), sum(map(dr.width, parts))), 0
     for part in parts:

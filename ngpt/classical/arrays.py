@@ -12,8 +12,9 @@ from ngpt.system.late import fft
 from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
-# The number of values of all results in one band of rows. About a dozen temporary arrays of this size fit into the
-# cache of a core. There, NumPy expressions are several times faster than over whole images.
+# The target size of a band of rows: the number of values in it, summed over all arrays. About a dozen temporary arrays
+# of this size fit into the cache of a core. In the cache, NumPy expressions are several times faster than over whole
+# images.
 BAND = 3 << 17
 
 

@@ -13,10 +13,10 @@ from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
 SUFFIXES = (".onnx", ".safetensors", ".tza")
-# The key of the inputs in the metadata of a network that blends frames (``ngpt.sequence.network``).
+# The key in the metadata that lists the inputs of a network that blends frames (``ngpt.sequence.network``).
 FRAMES = "ngpt.temporal inputs"
 
-# The settings of the training that are shown, by table.
+# The training settings that are shown, by table of the configuration
 _SETTINGS = {
     "data": ("folders", "validation"),
     "loss": ("kind",),
@@ -64,7 +64,7 @@ def _onnx(path: Path) -> dict[str, Any]:
 
 def _safetensors(path: Path) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("safetensors") is None:
-        raise NgptError(f"{path}: to read it needs PyTorch: {install_command('train')}")
+        raise NgptError(f"{path}: reading this file needs PyTorch: {install_command('train')}")
     # Importing torch takes seconds.
     from ngpt.network.safetensors import load_weights
 
@@ -83,7 +83,9 @@ def _whose(path: Path, claims: str) -> dict[str, Any]:
     ours = f"ngpt's own, method {identity.shipped}: the file that comes with ngpt {__version__}"
     return {
         "network": str(path),
-        "whose": ours if identity.shipped else f"none of those that come with ngpt {__version__}; it says: {claims}",
+        "whose": ours
+        if identity.shipped
+        else f"not a network that comes with ngpt {__version__}; the file describes itself as: {claims}",
         "sha256": identity.sha256,
         "bytes": path.stat().st_size,
     }
@@ -100,12 +102,18 @@ def _reads(names: Collection[str], base: str, runtime: str) -> dict[str, Any]:
 
 
 def _training(record: Any) -> dict[str, Any]:
-    """Facts of the record of a training. Anybody may have written it, so entries of another form are left out."""
+    """Facts from the record of a training.
+
+    The record may come from any program, so entries that do not have the expected type are left out.
+    """
     if not isinstance(record, dict):
         return {}
     facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}
     if isinstance(record.get("mean of"), list):
-        facts["mean of"] = f"{len(record['mean of'])} files; all else is of the first one"
+        facts["mean of"] = (
+            f"the average of the weights in {len(record['mean of'])} files; the other entries here describe the first "
+            "file"
+        )
     settings = record.get("settings")
     for table, names in _SETTINGS.items():
         values = settings.get(table) if isinstance(settings, dict) else None

@@ -3,14 +3,15 @@
     u16 0x41D7, u8 2, u8 0      magic and version
     u64                         the position of the table
     tensors                     each at a multiple of 64 bytes
-    u32                         their number, and for each of them
+    u32                         the number of tensors, and for each tensor
         u16, bytes              the name
         u8, u32 ...             the shape
         bytes                   the layout: "oihw" for kernels, "x" for biases
-        "f" or "h", u64         32 or 16 bits, and the position of its data
+        "f" or "h", u64         numbers of 32 or 16 bits, and the position of the tensor's data
 
 All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN accepts only tensors in 16 bits, and
-ignores tensors that it does not use. The name of such a tensor, the mark, says which of our images is the colour.
+ignores tensors that it does not use. So ngpt adds one unused tensor, the *mark*. Its name says which of ngpt's images
+(the primal, or a base) is OIDN's colour input. A base is the result of a classical reconstruction.
 """
 
 import struct
@@ -24,14 +25,17 @@ from ngpt.errors import NgptError
 from ngpt.system.reading import read_bytes
 
 MAGIC, VERSION, ALIGNMENT = 0x41D7, 2, 64
-# The beginning of the name of the mark; the name of the image follows: "primal", or the base.
+# The name of the mark begins with this text. The name of the image follows: "primal", or the name of a base.
 MARK = "ngpt.colour."
-# Limits against damaged or forged files; networks have less.
+# Limits that protect against damaged or forged files. Networks stay far below them.
 MOST_TENSORS, MOST_BYTES = 4096, 2**28
 
 
 def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
-    """The contents of a file: tensors of four or one dimensions, in 16 bits, with the mark for ``colour``."""
+    """The contents of a file with the given ``tensors`` in 16 bits, and the mark that names the image ``colour``.
+
+    The tensors have four dimensions or one.
+    """
     body, table = bytearray(12), bytearray()
     everything = dict(tensors) | {MARK + colour: np.ones(1)}
     for name, tensor in everything.items():
@@ -46,7 +50,7 @@ def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
 
 
 def read(path: Path) -> tuple[bytes, str]:
-    """The contents of a file, and the image that is its colour: "primal", or the name of a base.
+    """The contents of a file, and the name of the image that its network takes as colour input: "primal", or a base.
 
     Raises NgptError if the file is of another format, is damaged, or was not written by ngpt.
     """
@@ -55,13 +59,17 @@ def read(path: Path) -> tuple[bytes, str]:
     marks = [name.removeprefix(MARK) for name in shapes if name.startswith(MARK)]
     if len(marks) != 1 or marks[0] not in ("primal", *BASES):
         raise NgptError(
-            f"{path}: does not say which image it denoises, as files by `ngpt export` do; run it by OIDN's own tools"
+            f"{path}: was not written by `ngpt export`: it does not say which image it denoises; use it with OIDN's "
+            "own tools"
         )
     return data, marks[0]
 
 
 def _shapes(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
-    """Name -> shape of the tensors in a file. Raises NgptError if the file is damaged or of another format."""
+    """Returns the shape of each tensor in a file, by name.
+
+    Raises NgptError if the file is damaged or of another format.
+    """
     try:
         magic, version, _, place = struct.unpack_from("<HBBQ", data)
         if magic != MAGIC or version != VERSION:

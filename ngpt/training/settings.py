@@ -1,4 +1,4 @@
-"""The settings of a training run, which TOML files hold: ``configs/*.toml``."""
+"""The settings of a training run. They are stored in TOML files: ``configs/*.toml``."""
 
 import dataclasses
 import tomllib
@@ -24,7 +24,8 @@ class DataSettings:
     ``validation_share``  share of the scenes that are kept out if ``validation`` is empty, at least one scene; 0 keeps
                     none out
     ``crop``        side of an example in pixels
-    ``pairs``       share of examples that are pairs without a reference, if there are also crops with references
+    ``pairs``       share of examples without a reference, where one half of the samples is trained against the other
+                    half; only used if there are also crops with references
     ``kept``        folder for the references of sets that are rendered during training: references are rendered once,
                     and used again with new noise in the inputs. "" always renders new ones
     ``workers``     processes that prepare examples, at most one for each processor; 0 prepares them between steps
@@ -43,16 +44,18 @@ class DataSettings:
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Adam and its schedule (``ngpt.training.schedule``); defaults are NGPT's.
+    """Adam and its schedule (``ngpt.training.schedule``); the defaults are those of the NGPT paper (Kettunen et al.
+    2019).
 
     ``learning_rate``  the largest learning rate of the schedule
     ``betas``      decays of Adam's two moments
     ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
     ``warmup``     steps until the learning rate is reached; a tenth of the run if the run would end before that
     ``flat``       step until which the rate is constant ("paper")
-    ``half_life``  steps in which the rate then halves ("paper")
+    ``half_life``  after the step ``flat``, the rate halves in this number of steps ("paper")
     ``clip``       largest norm of the gradient; 0 does not clip
-    ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps no average
+    ``ema``        decay per step of the moving average of the weights. If set, this average is what is validated and
+                   exported; 0 means no average
     """
 
     learning_rate: float = 5e-4
@@ -93,9 +96,11 @@ class RunSettings:
 class TemporalSettings:
     """Settings for the network that blends frames (``ngpt.training.temporal``) in place of one that makes images.
 
-    ``methods``  the methods whose results it learns to blend
-    ``round``    steps of a round. At its beginning, the current network makes new histories of shots
-    ``clips``    number of clips in a round, drawn at random; a clip is a shot by one method
+    ``methods``  the reconstruction methods whose results it learns to blend
+    ``round``    number of training steps in a round. At the start of each round, the current network blends the frame
+                 sequences (shots) again, and training uses these results as the earlier frames
+    ``clips``    number of clips in a round, drawn at random. A clip is one shot, with its frames reconstructed by one
+                 of the methods
     """
 
     methods: tuple[str, ...] = ("ngpt-fast", "ngpt-combine", "oidn", "wcv")
@@ -172,8 +177,8 @@ def _check(settings: Settings, path: str) -> None:
     parts = [name for name in PARTS if settings.model is not None and name in settings.model.layers]
     if parts and settings.augmentation.quieter:
         raise NgptError(
-            f"{path}: augmentation.quieter: makes no {' and '.join(parts)} light, which the network reads, since "
-            "references are not split; leave it out"
+            f"{path}: augmentation.quieter: cannot be used with a network that reads {' and '.join(parts)}: references "
+            "do not contain these parts of the light separately; remove augmentation.quieter"
         )
     for name in ("steps", "batch", "log", "save", "validate"):
         if getattr(settings.run, name) < 1:
@@ -198,7 +203,10 @@ def _check_temporal(settings: Settings, table: TemporalSettings, path: str) -> N
     if settings.loss or settings.augmentation != Augmentation():
         raise NgptError(f"{path}: [loss] and [augmentation] are for networks that make images; leave them out")
     if streams := [folder for folder in settings.data.folders if folder.endswith(".toml")]:
-        raise NgptError(f"{path}: data.folders: {streams[0]}: shots are not rendered during training; make a set")
+        raise NgptError(
+            f"{path}: data.folders: {streams[0]}: shots cannot be rendered during training; render a data set "
+            "first and name its folder"
+        )
 
 
 def _change(values: dict[str, Any], change: str) -> None:

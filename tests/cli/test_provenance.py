@@ -84,7 +84,7 @@ def test_info_on_networks(own, command):
     assert report["bytes"] == (WEIGHTS / "ngpt-combine.onnx").stat().st_size
     own.rename(own.with_name("x.onnx"))
     output = command("info x.onnx").out
-    assert "whose: none of those that come with ngpt" in output and "it says: method 'ngpt-fast'" in output
+    assert "whose: not a network that comes with ngpt" in output and "itself as: method 'ngpt-fast'" in output
 
 
 LOG = (

@@ -277,7 +277,7 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
     stack = render_stack(load(renderer, "diffuse", (32, 24)), 8, 1, "primal", tails="shared")
     assert np.isfinite(stack["primal"]).all()
     (line,) = [line for line in caplog.messages if "cache" in line]
-    assert "the cache of tails is full" in line and "--unbiased" in line
+    assert "the light cache is full" in line and "--unbiased" in line
 
 
 def layers_of(scene, tails, spp):

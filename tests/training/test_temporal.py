@@ -126,7 +126,7 @@ def test_it_starts_from_weights_and_those_of_other_kinds_are_refused(finished, t
         ({"temporal": {"methods": []}}, "give one at least"),
         ({"temporal": {"round": 0}}, "temporal.round = 0: must be at least 1"),
         ({"loss": {"kind": "l1"}}, "are for networks that make images"),
-        ({"data": {"folders": ["data-shots.toml"]}}, "shots are not rendered during training"),
+        ({"data": {"folders": ["data-shots.toml"]}}, "shots cannot be rendered during training"),
     ],
 )
 def test_settings_are_checked(change, complaint):

@@ -1,1 +1,1 @@
-"""Short versions of ``gpt``, to be read before the fast one."""
+"""Short versions of ``gpt``, for readers who want to understand it before they read the fast version."""

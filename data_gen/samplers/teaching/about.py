@@ -15,7 +15,7 @@ register(
         },
         loses=THROUGH_HOLES,
         rank=9,
-        lane_bytes=320,  # five paths are recorded as one function, so all their results are in memory together
+        lane_bytes=320,  # one function traces all five paths, so their results are in memory at the same time
     )
 )
 register(

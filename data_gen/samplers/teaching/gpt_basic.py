@@ -1,15 +1,15 @@
 r"""The teaching gradient-domain path tracer: Algorithm 1 of the survey, random sequence replay.
 
 It is here to be read, and to check faster samplers. Each difference is between two complete path-traced samples, so
-little can go wrong, but no work is shared: one sample costs five.
+little can go wrong. But the paths share no work, so one sample costs as much as five paths.
 
     L               radiance of a path, a function of its random numbers u and its position on the film
     base, offset    the path through pixel p, and the path with the same u through a neighbour q of p
     Δ               L(u, q) - L(u, p): small, with low variance, where equal random numbers give similar paths
 
 The density of u is the same for both paths, so the Jacobian of the shift and the densities cancel (survey, eq. 6-8).
-The difference only needs two calls of Mitsuba's own estimator. Both directions of a difference, p to q and q to p, are
-sampled, each with weight 1/2.
+The difference only needs two calls of Mitsuba's own estimator. Each difference is sampled in both directions, from p to
+q and from q to p, with weight 1/2 each.
 
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 2.3 and Algorithm 1]
 """
@@ -37,7 +37,8 @@ class GPTBasic(GradientIntegrator):
     """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
 
     Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which determines the transport.
-    Not meant for production: after the first reflection that differs, shifted paths have nothing in common.
+    It is not meant for production: after the first reflection that differs, base and offset path have nothing in
+    common.
     """
 
     nested = True
@@ -74,7 +75,8 @@ class GPTBasic(GradientIntegrator):
     def radiance(self, scene, estimate, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
         """L(u, p + shift) without directly seen emission, that emission, and whether p + shift is on the film.
 
-        Direct emission has little noise, but its edges would be the strongest gradients of the image.
+        Directly seen emission is separate, because it has little noise, but its edges would be the strongest gradients
+        of the image.
         """
         ray, importance, inside = camera.rays(shift)
         medium = camera.sensor.get_medium()

@@ -1,15 +1,18 @@
-r"""The gradient-domain path tracer to be read: ``gpt`` with reconnection as the only shift.
+r"""A simple gradient-domain path tracer for readers who want to understand ``gpt``. Reconnection is its only shift.
 
-It renders scenes whose materials all scatter widely. There an offset path always goes straight from its own first
-vertex to the second vertex of its base path, so the code for the first two steps has no loop. The other techniques of
-``gpt`` (replay, half-vectors, ghosts, shared emitters, specialised kernels) are left out. Functions and symbols (x, y,
-L, Le, β, J, p, r, w, m, Δ, a) are as in ``data_gen.samplers.gpt.integrator``, to be read side by side. R is the
-radiance that reaches a settled path. r is 0 after a path is rejected.
+It renders scenes whose materials all scatter widely. In such scenes an offset path always goes straight from its own
+first vertex to the second vertex of its base path, so the code for the first two steps has no loop. The other
+techniques of ``gpt`` (replay, half-vectors, ghosts, shared emitters, specialised kernels) are left out. Functions and
+symbols (x, y, L, Le, β, J, p, r, w, m, Δ, a) are as in ``data_gen.samplers.gpt.integrator``, so both files can be read
+side by side.
 
-An offset path is *apart* from its base path at the first vertex. It is *joined* to it at the second, which it shares,
-but where it arrives from another direction. It is *settled* from the third vertex on, where both are the same path. A
-rejected path needs no extra code: with β' = 0 and r = 0, the formulas give w = 1 and Δ = -2 C(x) / p(x), as they
-should.
+At the first vertex an offset path is *apart* from its base path. At the second vertex it is *joined*: both paths share
+this vertex, but arrive from different directions. From the third vertex on it is *settled*: base and offset path are
+the same. R is the radiance that arrives from the third vertex on.
+
+The density ratio of the two paths, r, is set to 0 when a shift is rejected. A rejected path needs no extra code: its
+throughput and r are 0. The formulas then give w = 1 and Δ = -2 C(x) / p(x), as they should. Here C(x) is the
+contribution of base path x; the 2 is explained at ``data_gen.paths.mis.gradient_weight``.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
 sections 3.3, 3.5 and 4.1]
@@ -44,8 +47,8 @@ class GPTSimple(GradientIntegrator):
     Plugin ``gpt_simple``. Parameters, as for Mitsuba's ``path``: ``max_depth`` (default -1: no limit) and ``rr_depth``
     (5; Russian roulette never starts before the third vertex).
 
-    Not handled: mirrors, glass, polish, holes, media, hidden emitters and polarised variants. Media are ignored. For
-    the others rendering raises NgptError.
+    Not handled: mirrors, glass, rough materials of very low roughness (polish), holes, media, hidden emitters and
+    polarised variants. Rendering a scene with any of these raises NgptError.
     """
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
@@ -68,7 +71,7 @@ class GPTSimple(GradientIntegrator):
 
 
 def trace(scene, limits: Limits, random, ray, importance, shifted):
-    """L, Le and the four Δ, in the order of SHIFTS, of base paths that begin with ``ray``."""
+    """Returns L, Le and the four Δ (in the order of SHIFTS) of base paths that begin with ``ray``."""
     # ------------------ First vertex: offset paths are apart ------------------
     x = scene.ray_intersect(mi.Ray3f(ray))
     Le = importance * x.emitter(scene).eval(x, limits.max_depth > 0)
@@ -78,25 +81,25 @@ def trace(scene, limits: Limits, random, ray, importance, shifted):
     L = step.β * step.L_light + step.β1 * step.L_bsdf
     offsets = [step_apart(scene, step, y) for y in offsets]
 
-    # ------------------ Second vertex: they are joined to it ------------------
+    # ---------------- Second vertex: offset paths are joined ------------------
     step = base_step(scene, random, step.x1, step.β1, step.x1.is_valid() & (limits.max_depth > 2))
     L += step.β * step.L_light + step.β1 * step.L_bsdf
     settled = [step_joined(step, y) for y in offsets]
 
-    # --------------- From the third on: one path, so one radiance -------------
+    # ------------ From the third vertex on: one path, so one radiance ---------
     R = walk(scene, limits, random, step.x1)
     return L + step.β1 * R, Le, [Δ + a * R for Δ, a in settled]
 
 
 @dr.syntax
 def walk(scene, limits: Limits, random, x):
-    """R, the radiance that reaches the second vertex from ``x``, the third."""
+    """Returns R, the radiance that reaches the second vertex from the third vertex ``x``."""
     R, β, depth = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(3)
     active = x.is_valid() & (depth < limits.max_depth)
     while dr.hint(active, label="gpt_simple"):
         step = base_step(scene, random, x, β, active)
         R += β * step.L_light + step.β1 * step.L_bsdf
-        # Roulette by the throughput since the second vertex, which all five paths share, so it suits each of them.
+        # Roulette uses the throughput since the second vertex. All five paths share it, so roulette suits each of them.
         q = roulette(dr.max(step.β1), depth >= limits.rr_depth)
         survives = random.next_1d() < q
         x, β = step.x1, step.β1 / q
@@ -118,13 +121,13 @@ class Step:
     # BSDF sampling
     wo: mi.Vector3f
     p: mi.Float
-    goes_on: mi.Bool  # whether there is a next vertex, or an escape
+    goes_on: mi.Bool  # whether the path continues, to a next vertex or out of the scene
     β1: mi.Spectrum  # β f / p
     x1: mi.SurfaceInteraction3f
-    Le: mi.Spectrum  # emitted at x1 toward x
+    Le: mi.Spectrum  # the radiance emitted at x1 toward x
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
-    smooth: mi.Bool  # whether the event is no mirror and no hole
+    smooth: mi.Bool  # whether the scattering event is neither at a mirror nor a pass through a hole
     hole: mi.Bool  # whether the path passes a hole
     hit: mi.PreliminaryIntersection3f  # the hit at x1
 
@@ -133,7 +136,7 @@ class Step:
 class Offset:
     """The state of one offset path at the current vertex of its base path."""
 
-    y: mi.SurfaceInteraction3f  # apart: its own vertex; joined: the shared vertex, reached from its own
+    y: mi.SurfaceInteraction3f  # apart: the path's own vertex; joined: the shared vertex, seen from that vertex
     β: mi.Spectrum
     r: mi.Float
     Δ: mi.Spectrum
@@ -168,7 +171,11 @@ def reflected(light: LightSample, x) -> mi.Spectrum:
 
 
 def start(scene, active, ray, importance) -> Offset:
-    """An offset path up to its first vertex. If either path has no such vertex it is rejected, from both sides."""
+    """An offset path up to its first vertex.
+
+    If either path has no first vertex, the shift is rejected. It would also be rejected in the opposite direction, with
+    base and offset path exchanged.
+    """
     y = scene.ray_intersect(mi.Ray3f(ray))
     lives = active & y.is_valid()
     return Offset(y, β=dr.select(lives, importance, 0), r=dr.select(lives, mi.Float(1), 0), Δ=mi.Spectrum(0))
@@ -184,25 +191,30 @@ def step_apart(scene, step: Step, path: Offset) -> Offset:
     Δ = gradient_weight(path.r, True) * (path.β * reflected(light, y) - step.β * step.L_light)
 
     # -------------- BSDF sampling: reconnection -------------
-    # An escape counts as a vertex at infinity, to which the same direction leads, with J = 1.
+    # If the base path leaves the scene, its next vertex is at infinity. The same direction leads the offset path to
+    # that vertex, with J = 1.
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), x.to_world(step.wo))
     shadow = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
     J = dr.select(reaches, reconnection_jacobian(x.p, y.p, x1.p, x1.n), 1)
     f, p = evaluate(y.bsdf(), y, y.to_local(direction))
     r = path.r * J * p / step.p
-    # If y cannot see x1, no path goes that way, so none is shifted back, and w is 1 (survey, section 3.5).
+    # If y cannot see x1, the offset path does not exist. Then no path sampled from its pixel could be shifted back to
+    # this base path, so the base path gets the full weight w = 1 (survey, section 3.5).
     good = step.goes_on & (p > 0) & dr.isfinite(r) & ~scene.ray_test(shadow, step.goes_on & (path.r > 0))
     r, β = dr.select(good, r, 0), dr.select(good, path.β * f * (J / step.p), 0)
     y1 = seen_from(x1, direction)
     Le, p_light = emission(scene, y1, y, good, good)
-    # For this emission and all later light the pair has the new r, and a new weight (survey, eq. 17).
+    # For this emission and all later light, base and offset path have the new r, and a new weight (survey, eq. 17).
     Δ += gradient_weight(r, True) * (β * Le * mis_weight(p, p_light) - step.β1 * step.L_bsdf)
     return Offset(y1, β, r, Δ)
 
 
 def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """The step from the shared vertex, where the offset path arrives from another direction. Returns Δ so far and a."""
+    """The step from the shared vertex, where the offset path arrives from another direction than the base path.
+
+    Returns Δ so far, and the factor ``a`` with which the later radiance R adds to it (Δ + a R).
+    """
     y = path.y
 
     # ---------- Emitter sampling: the same emitter ----------
@@ -210,8 +222,8 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
     Δ = path.Δ + w2 * (path.β * reflected(step.light, y) - step.β * step.L_light)
 
     # ---------- BSDF sampling: the same direction -----------
-    # Vertex and direction are the same, so J = 1. But the density of that direction depends on the direction of
-    # arrival.
+    # Both paths leave the same vertex in the same direction, so J = 1. But the density of that direction depends on the
+    # direction from which a path arrives.
     f, p = evaluate(y.bsdf(), y, step.wo)
     good = step.goes_on & (p > 0)
     r, β = dr.select(good, path.r * p / step.p, 0), dr.select(good, path.β * f / step.p, 0)
@@ -222,7 +234,11 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
 
 
 def refuse(scene) -> None:
-    """Raises NgptError for materials at which paths cannot be reconnected, including polish, which no rule detects."""
+    """Raises NgptError for materials at which paths cannot be reconnected.
+
+    These include rough materials of very low roughness (polish), which the registry's rules for refusing scenes do not
+    check.
+    """
     if materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"
