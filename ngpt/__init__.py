@@ -36,15 +36,15 @@ if TYPE_CHECKING:
     from ngpt.stack import GradientStack as GradientStack
     from ngpt.system.limits import limit_threads as limit_threads
 
-# Official builds of ONNX Runtime send telemetry (SECURITY.md) unless this variable is set when they are loaded, which
-# other code, such as PyTorch's exporters, may do first.
+# Official builds of ONNX Runtime send telemetry (SECURITY.md) unless this variable is set when ONNX Runtime is loaded.
+# Other code, such as PyTorch's exporters, may load it before ngpt does, so the variable is set at once.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # Nothing is logged unless a program sets a handler and a level: logging.getLogger("ngpt").setLevel("INFO").
 logging.getLogger("ngpt").addHandler(logging.NullHandler())
 
-# The module of each public name. It is imported on first use, so that importing this package does not load NumPy and
-# SciPy. Commands then start, and handle interrupts, at once.
+# The module of each public name. A module is imported when one of its names is first used, so that importing this
+# package does not load NumPy and SciPy. So commands start, and handle interrupts, at once.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "Temporal": "sequence.history", "merge": "merging"}
 _HOMES |= {"limit_threads": "system.limits", "reconstruct_with_error": "api.uncertainty"}
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")

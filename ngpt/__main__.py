@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> int:
-    """Runs the command line. Ctrl-C while the command is still being imported ends in one line too."""
+    """Runs the command line. Ctrl-C prints one line too if the command is still being imported."""
     try:
         from ngpt.cli import main as run
     except KeyboardInterrupt:

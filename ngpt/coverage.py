@@ -1,11 +1,11 @@
 """Keeps results dark in empty pixels, where alpha is 0 and the input has no light.
 
-Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to the background. Such light, and
-dark pixels among it, are not changed.
+Light is premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to the background. Pixels with such
+light, and dark pixels among them, are not changed.
 
 Light that a method spreads into empty pixels is missing in covered pixels. Hair, for example, may cover a tenth of each
-pixel, so that few samples hit it and a method blurs it. Therefore the light in empty pixels is given back to the
-covered pixels around them, in proportion to their alpha, up to the light that the input has there.
+pixel. Then few samples hit the hair, and a method blurs it. Therefore the light in empty pixels is given back to the
+covered pixels around them, in proportion to their alpha, but only as much as the result has less light than the input.
 """
 
 import numpy as np
@@ -13,14 +13,14 @@ import numpy as np
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
-# Side, in pixels, of the square around light at alpha 0 in which black pixels may be black by chance
+# Side, in pixels, of a square around each pixel with light at alpha 0. Black pixels in it may be black by chance.
 _CHANCE = 5
 # Standard deviation, in pixels, of the window in which light is given back
 _WINDOW = 2.0
 
 
 def empty_pixels(stack: GradientStack) -> np.ndarray:
-    """The empty pixels, (H, W) booleans. None are empty if most light is at alpha 0: then alpha is not coverage."""
+    """The empty pixels, (H, W) booleans. If most light is at alpha 0, alpha is not coverage, and no pixel is empty."""
     if "alpha" not in stack:
         return np.zeros((stack.height, stack.width), bool)
     uncovered = stack["alpha"][..., 0] == 0
@@ -48,8 +48,8 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
 def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
     """The image (H, W, C) with its ``empty`` pixels filled by reflection at the nearest covered pixel.
 
-    If the reflected pixel is not in the same island of covered pixels, the nearest pixel itself is taken. So each
-    island is continued by light and noise like its own.
+    If the reflected pixel and the nearest pixel are not in the same island of covered pixels, the nearest pixel itself
+    is taken. So each island is continued by light and noise like its own.
     """
     if not empty.any() or empty.all():
         return image
@@ -62,7 +62,7 @@ def mirrored(image: np.ndarray, empty: np.ndarray) -> np.ndarray:
 
 
 def _around(values: np.ndarray) -> np.ndarray:
-    """The mean of (H, W, C) in a Gaussian window around each pixel; pixels outside of the image are 0."""
+    """Averages (H, W, C) in a Gaussian window around each pixel. Pixels outside of the image count as 0."""
     return ndimage.gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)
 
 

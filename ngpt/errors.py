@@ -9,8 +9,8 @@ class NgptError(ValueError):
     """A problem that the user can solve.
 
     The message is one line that names the file, the layer and the wrong number, and says what to do. Line breaks are
-    removed and long texts shortened, since text from a broken file may have a megabyte. The command line prints the
-    message and ends with status 1.
+    removed and long texts are shortened, because text from a broken file may be a megabyte long. The command line
+    prints the message and ends with status 1.
     """
 
     def __init__(self, message: str):
@@ -37,16 +37,17 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 class Interrupted(KeyboardInterrupt):
     """The exception that Ctrl-C and SIGTERM raise in a command.
 
-    It is not a plain KeyboardInterrupt: if one has passed through code compiled from a string, such as that of
-    dataclasses and named tuples, Python 3.11 ends by SIGINT with another exit status.
+    It is a subclass and not KeyboardInterrupt itself. If a plain KeyboardInterrupt has passed through code compiled
+    from a string, such as the code of dataclasses and named tuples, Python 3.11 ends by SIGINT, with another exit
+    status.
     """
 
 
 def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if ``error`` was caused by one, as after Ctrl-C in a library that wraps exceptions.
+    """Raises KeyboardInterrupt if ``error`` comes from a KeyboardInterrupt that another library has wrapped.
 
     Dr.Jit's loops and recordings turn a KeyboardInterrupt into a RuntimeError with a cause. Mitsuba's plugins turn it
-    into a RuntimeError whose text ends in its name.
+    into a RuntimeError whose text ends in the name of the exception.
     """
     cause: BaseException | None = error
     while cause is not None:

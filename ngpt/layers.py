@@ -59,7 +59,8 @@ def stored_channels(name: str) -> tuple[str, ...]:
     return tuple(suffix if name in ("primal", "alpha") else f"{name}.{suffix}" for suffix in LAYERS[name].channels)
 
 
-# Layers of differences -> offset (x, y, frames) from a pixel to the pixel that it is subtracted from; y points down.
+# Layers of differences -> offset (x, y, frames) from a pixel to another one, with y pointing down. The difference is
+# the value of the other pixel minus the value of the pixel itself.
 DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}
 
 # Header attribute: the variance of the pixel mean of ``albedo`` or ``normal``, whichever is larger, averaged over

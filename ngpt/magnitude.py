@@ -1,12 +1,13 @@
 """Scales very bright or dark light so that single precision can hold its squares, and scales results back.
 
 Methods square light and divide by variances in single precision, which ends at 2^±127. So a stack whose typical light
-is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method reads it, and the result is divided by it.
-Both are exact. All other stacks are not changed.
+is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method reads it, and the result is divided by the
+same power. Both operations are exact. Other stacks are not changed.
 
-Light of 1e-30 has variances of 1e-60, which single precision cannot hold. ``GradientStack`` keeps variances in double
-precision if they are passed so. In files and in arrays of single precision, they are 0 or infinite. Infinite variances
-count as unknown, and so do variances of 0 of light that is so dark that its square may underflow.
+Light of 1e-30 has variances near 1e-60, and light of 1e30 has variances near 1e60. Single precision cannot hold either.
+``GradientStack`` keeps such variances if they are passed in double precision. In files, and in arrays of single
+precision, these variances are 0 or infinite. Infinite variances count as unknown. A variance of 0 also counts as
+unknown if the light is so dark that its square may underflow.
 """
 
 import math
@@ -19,14 +20,15 @@ from ngpt.stack import GradientStack
 
 # Methods are made for typical light from 2^-ORDINARY to 2^ORDINARY: a millionth to a million.
 ORDINARY = 20
-# The largest power of two of scaled light, whose square float32 can hold
+# Dark light is scaled up to at most 2^_LARGEST, so that float32 can hold its square.
 _LARGEST = 62
-# Below 2^-_DIM, variances of light may be 0 by underflow: a millionth of its square is below 2^-148.
+# Variances of light below 2^-_DIM may underflow to 0: a millionth of the square of such light is below 2^-148.
 _DIM = 64
-# The number of values sampled for the typical light. Their distance is not a multiple of 3, so that all colours occur.
+# About this many values are sampled for the typical light. Their distance is not a multiple of 3, so that all colours
+# occur.
 _LOOKED_AT = 1 << 16
 
-# Light above which sums of squares may leave single precision
+# Sums of squares of light above this may leave single precision.
 WIDE = 2.0**60
 
 LIGHT = tuple(name for name, layer in LAYERS.items() if layer.channels == RGB and name != "albedo")
@@ -34,10 +36,10 @@ VARIANCES = tuple(name for name in LIGHT if name.endswith("_var"))
 
 
 def magnitude(stack: GradientStack) -> int:
-    """The power of two by which the light of a stack is to be divided; 0 for ordinary light, and if there is no light.
+    """The exponent of the power of two by which to divide a stack's light; 0 for ordinary light, and for no light.
 
-    It is the power of two of the typical light: the median of the primal's finite values other than 0. It is larger if
-    the squares of the largest values would otherwise not be finite.
+    It is the exponent of the typical light, which is the median of the primal's finite values other than 0, without
+    their signs. For dark stacks, it is larger if the squares of the largest values would otherwise not be finite.
     """
     primal = stack["primal"]
     flat = primal.reshape(-1)
@@ -57,8 +59,8 @@ def magnitude(stack: GradientStack) -> int:
 def bound(image: np.ndarray) -> float:
     """The limit above which light counts as an outlier.
 
-    It is infinite unless some light is above ``WIDE``, as single fireflies may be. Then it is 2^``ORDINARY`` times the
-    typical light, but at most ``WIDE``.
+    If no light is above ``WIDE``, the limit is infinite. If some light is (single fireflies may be), the limit is
+    2^``ORDINARY`` times the typical light, but at most ``WIDE``.
     """
     if np.abs(image).max(initial=0) <= WIDE:
         return math.inf
@@ -73,7 +75,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def scaled(stack: GradientStack, power: int) -> GradientStack:
-    """The stack with 2^-power times its light, all layers in single precision."""
+    """Returns the stack with its light multiplied by 2^-power, and with all layers in single precision."""
     changed = {}
     for name in stack.names:
         layer = stack[name]
@@ -91,6 +93,6 @@ def scaled(stack: GradientStack, power: int) -> GradientStack:
 
 
 def enlarged(light: np.ndarray, power: int) -> np.ndarray:
-    """2^power times the light, of the same type; infinite where this type cannot hold it."""
+    """Returns the light multiplied by 2^power, in the same type; infinite where this type cannot hold the product."""
     with np.errstate(over="ignore", under="ignore"):
         return np.ldexp(light, power) if power else light

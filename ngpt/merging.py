@@ -1,4 +1,4 @@
-"""Merging of independent stacks of one image into a stack with the samples and pixels of all.
+"""Merges independent stacks of one image into a stack that has the samples and the pixels of all of them.
 
 With n_i samples per pixel, means m_i and variances of the mean v_i, the stack of all N = Σ n_i samples has
 
@@ -8,9 +8,10 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 [Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
 
 The expectation of this variance is the variance of m for any weights n_i that do not depend on the samples. So the
-formula also holds for differences, whose two directions may have different numbers of samples.
+formula also holds for differences. Their two pixels may have different numbers of samples, and n_i is the harmonic mean
+of these numbers.
 
-Stacks in different places of one picture are tiles. Each counts only in its own pixels.
+Stacks in different places of one picture are tiles. A tile counts only in its own pixels.
 """
 
 import logging
@@ -41,8 +42,8 @@ UNFINISHED = "ngpt:unfinished"
 REQUEST = "ngpt:request"
 # Attribute: the sampler's options that are not defaults, separated by commas
 OPTIONS = "ngpt:samplerOptions"
-# Values of the sampler's option ``tails``: after its first steps, a path takes light from a cache that paths share, or
-# finds light itself, which is the default.
+# Values of the sampler's option ``tails``. Shared: after its first steps, a path takes light from a cache that all
+# paths share. Paths, the default: each path finds all of its light itself.
 SHARED_TAILS, WHOLE_PATHS = "tails=shared", "tails=paths"
 # The limit for samples of a pixel: headers count them in 32 bits.
 _MOST = 2.0**31
@@ -51,24 +52,25 @@ _MOST = 2.0**31
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     """Merges stacks of the same scene, camera and sampler, with different seeds or in different places.
 
-    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it; means of differences by the
-    harmonic mean of the samples of both pixels. The merged ``samples`` are sums, and are left out if all pixels have
-    the same number. ``diagnostics.*`` channels are averaged like layers. So are subpixels, if all stacks have the same
-    K; otherwise they are left out with a warning. A pixel without any finite sample is NaN. A stack with one sample per
-    pixel needs no variances.
+    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` if a stack has it. Means of differences are weighted
+    by the harmonic mean of both pixels' numbers of samples. The merged ``samples`` are sums, and are left out if all
+    pixels have the same number. ``diagnostics.*`` channels are averaged like layers. Subpixels (K x K for each pixel)
+    are averaged too if all stacks have the same K; otherwise they are left out with a warning. A pixel without any
+    finite sample is NaN. A stack with one sample per pixel needs no variances.
 
     The result of stacks with n1 and n2 samples equals a stack of n1 + n2 samples up to rounding, with two exceptions.
-    Variances of dx and dy combine two independent directions, which a stack no longer separates: the merged value has
-    the same expectation, and differs by about 1 / N of itself. ``shared`` is averaged like the primal, because samples
-    of independent noise add like the noise itself; a stack without it counts as zero. ``primal_var`` includes the
-    variance of the merged ``shared``, which has the same expectation as the variances in the parts.
+    First, variances of dx and dy combine two independent directions, which a stack no longer separates. So a merged
+    variance has the same expectation, but differs by about 1 / N of its value. Second, the layer ``shared`` is a sample
+    of the noise that pixels share. It is averaged like the primal, because samples of independent noise add like the
+    noise itself; for a stack without this layer, it counts as zero. ``primal_var`` includes the variance that is
+    estimated from the merged ``shared``. This variance has the same expectation as the one that follows from the parts.
 
-    Tiles (``GradientStack.place``) must fill the smallest rectangle that holds them all. They may overlap; only then
-    must their seeds differ. The difference from a tile's last column or row to the pixel beyond it was not sampled: it
-    is NaN if no other tile has it, and a reconstruction leaves it out.
+    Tiles (``GradientStack.place``) must fill the smallest rectangle that holds them all. Tiles that overlap must have
+    different seeds. The difference between a tile's last column or row and the pixel beyond was not sampled. If no
+    other tile has that difference, it is NaN, and a reconstruction leaves it out.
 
-    The result's ``ngpt:seed`` lists all seeds. ``ngpt:spp`` and ``ngpt:tailsCut`` are means, ``ngpt:seconds`` and
-    ``ngpt:discarded`` sums. ``ngpt:samplerOptions`` and ``ngpt:tails`` have the entries of all stacks;
+    The result's ``ngpt:seed`` lists all seeds. ``ngpt:spp`` and ``ngpt:tailsCut`` are means; ``ngpt:seconds`` and
+    ``ngpt:discarded`` are sums. ``ngpt:samplerOptions`` and ``ngpt:tails`` have the entries of all stacks;
     ``tails=paths`` is added if only some stacks have ``tails=shared``. ``ngpt:gathered`` is 1 if any stack has it.
     ``ngpt:featureNoise`` is the noise of the merged features if all stacks have it. ``ngpt:unfinished`` and
     ``ngpt:request`` are left out. All other attributes come from the first stack.
@@ -144,7 +146,7 @@ class _Tile:
 
     @property
     def part(self) -> tuple[slice, slice]:
-        """Its rows and columns in the canvas."""
+        """The tile's rows and columns in the canvas."""
         return self.stack.place.data.within(self.canvas)
 
     @cached_property
@@ -153,8 +155,8 @@ class _Tile:
         return _counts(self.stack, self.spp)
 
     def weights(self, name: str) -> np.ndarray:
-        """The weights (H, W, 1) of a layer in means: the counts of samples, or for differences the harmonic mean of the
-        counts of both pixels. They are 0 where the second pixel is outside the tile and inside the canvas."""
+        """The weights (H, W, 1) of a layer in means: the counts of samples. For differences, they are the harmonic mean
+        of the counts of both pixels, or 0 if the second pixel is outside the tile but inside the canvas."""
         if name not in DIFFERENCES:
             return self.counts
         x, y, _ = DIFFERENCES[name]
@@ -188,7 +190,7 @@ def _counts(stack: GradientStack, spp: int) -> np.ndarray:
 
 
 def _summed(tiles: Sequence[_Tile], values: Callable[[_Tile], np.ndarray]) -> np.ndarray:
-    """The sum over all tiles of their values (h, w, C), in each pixel of the canvas, (H, W, C)."""
+    """Adds up the ``values`` (h, w, C) of all tiles in each pixel of the canvas, and returns the sums (H, W, C)."""
     parts = [values(tile) for tile in tiles]
     total = np.zeros((tiles[0].canvas.height, tiles[0].canvas.width, parts[0].shape[2]))
     for tile, part in zip(tiles, parts, strict=True):
@@ -197,9 +199,10 @@ def _summed(tiles: Sequence[_Tile], values: Callable[[_Tile], np.ndarray]) -> np
 
 
 def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str = "", k: int = 1) -> np.ndarray:
-    """The mean, on the whole canvas, of layers (h, w, C), or channels (h, w), of K x K subpixels; double precision.
+    """Returns the mean of the tiles' ``values`` on the whole canvas, in double precision.
 
-    NaNs do not count. The weights are those of the layer ``name``.
+    The values are layers (h, w, C) or channels (h, w), which have K x K values for each pixel. NaNs do not count. The
+    weights are those of the layer ``name``.
     """
     canvas = tiles[0].canvas
     total = np.zeros((k * canvas.height, k * canvas.width, *values[tiles[0]].shape[2:]))
@@ -207,7 +210,7 @@ def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str 
     for tile in tiles:
         layer, n, part = values[tile], spread(tile.weights(name), k), within(tile.part, k)
         w = (n if layer.ndim == 3 else n[..., 0]) * ~np.isnan(layer)
-        # Products of infinite values and zero weights are left out, not added.
+        # Infinite values with weight 0 are left out, because their products are NaN.
         total[part] += np.where(w > 0, w * layer.astype(np.float64), 0)
         weight[part] += w
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -258,7 +261,7 @@ def _tails(stacks: Sequence[GradientStack], spp: Sequence[int]) -> dict[str, Any
 
 
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
-    """The values that the variance belongs to, in double precision: for the primal, its light outside ``caustic``."""
+    """The values whose variance the stack holds, in double precision: for the primal, its light outside ``caustic``."""
     values = stack[name].astype(np.float64)
     if name == "primal" and "caustic" in stack:
         with np.errstate(invalid="ignore"):
@@ -304,7 +307,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
         if stack.place.display != first.place.display:
             places = f"{stack.path} is {stack.place} but {first.path} is {first.place}"
             raise NgptError(f"{places}; merge seeds or tiles of one image")
-        # As text, because files of other programs may hold anything under our names.
+        # Attributes are compared as text, because files of other programs may hold anything under our names.
         ours, theirs = (str(s.attributes.get("ngpt:sampler")) for s in (stack, first))
         if ours != theirs:
             made = f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'"
@@ -340,7 +343,7 @@ def _means(stack: GradientStack) -> set[str]:
 
 
 def _samples(stack: GradientStack) -> int:
-    """The attribute ``ngpt:spp``. Raises NgptError if it is missing or no positive number."""
+    """The attribute ``ngpt:spp``. Raises NgptError if it is missing or not a positive whole number."""
     spp = stack.attributes.get("ngpt:spp")
     if not isinstance(spp, int | np.integer) or spp < 1:
         what = "has no attribute 'ngpt:spp'" if spp is None else f"attribute 'ngpt:spp' is {spp!r}"
@@ -349,7 +352,7 @@ def _samples(stack: GradientStack) -> int:
 
 
 def _number(stack: GradientStack, name: str) -> Any:
-    """An attribute, int or float. Raises NgptError if it is negative or no finite number."""
+    """An attribute, int or float. Raises NgptError if it is negative or not a finite number."""
     given, value = stack.attributes[name], stack.number(name)
     if value is None or value < 0:
         raise NgptError(f"{stack.path}: attribute '{name}' is {given!r}, and no number that can be merged; remove it")

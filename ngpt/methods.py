@@ -38,15 +38,15 @@ class Method:
     ``summary``  one line for the user
     ``needs``    layers that the stack must hold
     ``run``      (Repaired, options) -> (H, W, 3) float32, a reconstruction of the light in Repaired's ``image``
-    ``options``  the options it takes
-    ``standing`` one of ``ngpt.options.STANDINGS``; help shows the methods by it
-    ``missing``  returns the package or file that it lacks on this machine; "" if it can be used
-    ``uses``     further layers that it uses if the stack has them
-    ``estimates``  layers that it estimates from the others if the stack lacks them
-    ``variant``  the method that it runs with other defaults; "" if it is not a variant
+    ``options``  the options of the method
+    ``standing`` one of ``ngpt.options.STANDINGS``; help lists the methods by their standing
+    ``missing``  returns the package or file that the method lacks on this machine; "" if the method can be used
+    ``uses``     further layers that the method uses if the stack has them
+    ``estimates``  layers that the method estimates from the other layers if the stack lacks them
+    ``variant``  the method that this one runs with other defaults; "" if it is not a variant
     ``apart``    whether the light of photons is taken out of the image and denoised by ``ngpt.denoisers.caustic``
-    ``rec709``   whether it was made for colours of Rec. 709, so that colours of other primaries within the gamut of
-                 Rec. 709 are converted for it
+    ``rec709``   whether the method was made for colours of Rec. 709. If it was, colours of other primaries are
+                 converted for it if they are within the gamut of Rec. 709
     """
 
     summary: str
@@ -67,13 +67,13 @@ class Result:
     """A reconstruction and the facts about its making.
 
     ``image``      (H, W, 3) float32, scene-linear, in the units of the stack's primal
-    ``method``     the method that made it, also for "auto"; "own network FILE" for weights that do not come with ngpt
+    ``method``     the method that ran, also if "auto" chose it; "own network FILE" for weights that ngpt does not ship
     ``seconds``    wall time of repair and reconstruction, without file access
     ``repaired``   pixels of the primal that were not finite and were replaced
     ``untrusted``  differences that were left out because they, or one of their two pixels, were not finite
     ``weights``    the file of the network that ran; None for methods without one
     ``options``    the options with other values than the method's defaults, except ``weights``
-    ``estimated``  layers that the stack lacks and the method estimated
+    ``estimated``  layers that the stack lacks, and that the method has estimated
     ``error``      (H, W, 3) float32, the standard error of the image if it was requested (``ngpt.api.uncertainty``)
     """
 
@@ -127,7 +127,7 @@ def _network(
 
 
 def _variant(method: str, summary: str, **options: Any) -> Method:
-    """The method with other defaults, as a method of its own, so that tables can name it."""
+    """Returns a method with other defaults as a separate method, so that tables can name it."""
     entry = _OURS[method]
     other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
     return replace(entry, summary=summary, options=entry.options | other, variant=method)
@@ -212,7 +212,8 @@ def runnable(name: str) -> Method:
 
 
 # The methods that "auto" chooses from, the best first (docs/lab/RESULTS.md, "By the layers of a stack"). ngpt-primal is
-# left out: in the same total time, its error equals OIDN's in blind rooms, and is larger in simple scenes.
+# left out. In the same total time, its error equals OIDN's in blind rooms (which no training or choice has used), and
+# is larger than OIDN's in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
@@ -233,8 +234,8 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
 def check_request(method: str, options: Mapping[str, Any]) -> None:
     """Raises NgptError if ``reconstruct`` would refuse this method and these options for any stack.
 
-    The method may lack a package, an option may be unknown or have a wrong value, weights may be unreadable, or a
-    device may be unusable.
+    ``reconstruct`` refuses them if the method lacks a package, an option is unknown or has a wrong value, weights are
+    unreadable, or a device is unusable.
     """
     own = options.get("weights")
     if own:
@@ -278,9 +279,9 @@ def _check_network(method: str, values: dict[str, Any]) -> None:
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
     """Runs a method on a stack. The left and right borders of panoramas count as neighbours (``ngpt.panorama``).
 
-    ``method`` is "auto" or a name in ``METHODS``, and ``options`` are options of the method: for l2 and l1 ``alpha``, a
-    number, or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, for missing
-    layers, and for a primal without any finite pixel.
+    ``method`` is "auto" or a name in ``METHODS``, and ``options`` are options of the method. For example, l2 and l1
+    have ``alpha``: a number, or "auto" to derive it from the variances. Raises NgptError for an unknown method or
+    option, for missing layers, and for a primal without any finite pixel.
     """
     if wraps(stack):
         result, data = reconstruct(continued(stack), method, **options), repair(stack)
@@ -290,7 +291,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     own = options.get("weights")
     name = method
     if method == "auto":
-        # Weights name the layers that they need, so any method that runs networks can run them.
+        # The file of own weights names the layers that they need, so any method that runs networks can run them.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
         raise unknown_method(name)

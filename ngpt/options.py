@@ -8,7 +8,7 @@ from typing import Any
 
 from ngpt.errors import WrongUse, did_you_mean
 
-# The audience of a sampler or method: all users, users with a special need, researchers
+# The standing of a sampler or method says for whom it is: all users, users with a special need, or researchers.
 STANDINGS = ("use", "niche", "study")
 
 Value = bool | int | float | str
@@ -17,11 +17,11 @@ _ANY = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Option:
-    """An option. The ``default`` has its type.
+    """An option. Its values have the type of its ``default``, or are numbers if a text as default has a ``range``.
 
     ``meaning``  one line for the user
     ``choices``  the allowed values; () for any
-    ``range``    the least and the greatest number that is allowed; with ``choices``, these are allowed too
+    ``range``    the least and the greatest number that is allowed; ``choices`` outside of the range are allowed too
     """
 
     default: Value
@@ -46,7 +46,7 @@ class Option:
         return f"{kind}, or {words}" if words else kind
 
     def check(self, value: Any) -> Value:
-        """The ``value``, which may be a text, in the option's type. Raises WrongUse if it is not allowed."""
+        """Converts the ``value``, which may be a text, to the option's type. Raises WrongUse if it is not allowed."""
         if self.choices and (given := self._typed(value, type(self.choices[0]))) in self.choices:
             assert given is not None
             return given

@@ -1,6 +1,6 @@
-"""Panoramas of 360 degrees, whose left and right borders are neighbours: they are continued on both sides for methods.
+"""Continues panoramas of 360 degrees on both sides for methods, because their left and right borders are neighbours.
 
-The header marks them by OpenEXR's ``envmap`` for latitude and longitude, or by ``ngpt:wrap``.
+The header of a panorama has OpenEXR's ``envmap`` for latitude and longitude, or ``ngpt:wrap``.
 """
 
 from dataclasses import replace
@@ -28,7 +28,7 @@ def wrapping(stack: GradientStack) -> GradientStack:
 
 
 def continued(stack: GradientStack) -> GradientStack:
-    """A panorama (H, W) as a plain stack (H, W + 2 MARGIN), with the opposite columns added beside each border.
+    """Returns a panorama (H, W) as a plain stack (H, W + 2 MARGIN): beside each border, it has columns from the other.
 
     Differences between the last column and the first are not known, and become NaN.
     """

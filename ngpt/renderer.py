@@ -1,7 +1,7 @@
 """The interface of a renderer for the evaluation, ``ngpt info`` and ``ngpt train``.
 
-``ngpt.system.parts.find_renderer`` returns the installed renderer, ``data_gen.service``, which an entry point of the
-group "ngpt.renderers" names. Nothing in ngpt imports it.
+An entry point of the group "ngpt.renderers" names the installed renderer, ``data_gen.service``, and
+``ngpt.system.parts.find_renderer`` returns it. Nothing in ngpt imports the renderer directly.
 """
 
 from collections.abc import Mapping
@@ -35,10 +35,10 @@ class Renderer(Protocol):
     def measure(
         self, scene: Any, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
     ) -> tuple[dict[str, list[float]], GradientStack]:
-        """The seconds per sample of each of the named ``renders``, and the last stack of the first one."""
+        """Measures the seconds per sample of each of the named ``renders``. Also returns the first one's last stack."""
 
     def batch(self, sampler: str) -> int:
-        """The number of samples per pixel in a group that depend on each other; 0 if all are independent."""
+        """The number of samples per pixel in a group of dependent samples; 0 if all samples are independent."""
 
     def gradients(self, sampler: str) -> bool:
         """Whether the sampler renders gradients; True for an unknown one."""
@@ -50,7 +50,7 @@ class Renderer(Protocol):
         """
 
     def code(self, sampler: str) -> str:
-        """A hash of the code that a render by the sampler, which may be "auto", runs."""
+        """A hash of the code that runs in a render by this sampler, which may be "auto"."""
 
     def scene_code(self, name: str) -> str:
         """A hash of a built-in scene."""

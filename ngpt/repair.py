@@ -23,7 +23,7 @@ class Repaired:
     ``direct``   (H, W, 3) direct emission, which is added to the result
     ``dx, dy``   (H, W, 3) gradients, 0 where they are not trusted; None if the stack has none
     ``trusted``  where dx and dy are trusted, (H, W) booleans each; None if all differences are trusted
-    ``variances``  of image, dx and dy, (H, W, 3) each; None if the stack lacks one of them
+    ``variances``  the variances of image, dx and dy, (H, W, 3) each; None if the stack lacks one of them
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, if the stack has them; 0 where they are not finite
@@ -58,7 +58,7 @@ class Repaired:
     by_oidn: Any = None
 
     def known_variances(self) -> dict[str, np.ndarray]:
-        """The known variances of image, dx and dy, by the names of their layers: all three, primal_var, or none."""
+        """The known variances of image, dx and dy, by names of their layers: all three, only primal_var, or none."""
         if self.variances is not None:
             return dict(zip(("primal_var", "dx_var", "dy_var"), self.variances, strict=True))
         return {} if self.noise is None else {"primal_var": self.noise}
@@ -67,8 +67,8 @@ class Repaired:
 def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     """Separates direct emission, replaces non-finite pixels, and finds the gradients that cannot be trusted.
 
-    ``gradients``  whether ``caustic`` is separated too, for methods that read gradients or leave the light of photons
-                   to another method. Otherwise image is the whole primal, with its whole variance
+    ``gradients``  whether ``caustic`` is separated too, as is right for methods that read gradients or leave the light
+                   of photons to another method. If False, image and its variance include ``caustic``
 
     A difference is not trusted if it or one of its two pixels is not finite. Raises NgptError if no pixel of the primal
     is finite.
@@ -131,7 +131,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
 
 
 def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
-    """``Repaired.parts``. Pixels that are not ``good``, or where a part is not finite, are filled from neighbours."""
+    """Returns ``Repaired.parts``. Pixels that are not ``good`` or not finite in a part are filled from neighbours."""
     held = [name for name in ("diffuse", "specular") if name in stack]
     for name in held:
         good = good & finite_pixels(stack[name])
@@ -157,14 +157,14 @@ def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndar
 def finite_pixels(layer: np.ndarray) -> np.ndarray:
     """Where all channels of (H, W, C) are finite, (H, W) booleans."""
     good = np.isfinite(layer)
-    # Reductions along a short last axis are slow, and most layers are finite.
+    # Most layers are finite, and for these the slow reduction along a short last axis is not needed.
     return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
 
 
 def _finite_subpixels(
     stack: GradientStack, light: np.ndarray, features: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """The subpixels of a stack. Non-finite ones are replaced by their repaired pixels: ``light``, or ``features``."""
+    """The subpixels of a stack. Non-finite ones get the repaired value of their pixel in ``light`` or ``features``."""
     k = subpixels(stack.fine, stack.width)
     fine = {}
     for name, layer in stack.fine.items():
@@ -187,8 +187,9 @@ def _where(flags: np.ndarray, variance: np.ndarray) -> np.ndarray:
 def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
     """The light (H, W, 3) with all pixels replaced that are not ``good``.
 
-    A pixel becomes the mean of the good pixels among its eight neighbours. If there are none, it becomes the mean of
-    the good pixels in the smallest block that has any: of 8x8 pixels, 64x64, and so on.
+    A replaced pixel becomes the mean of the good pixels among its eight neighbours. If no neighbour is good, the pixel
+    becomes the mean of the good pixels in the smallest block around it that has any. Blocks have 8x8 pixels, 64x64, and
+    so on.
     """
     image = np.where(good[..., None], light, np.float32(0))
     weight = ndimage.uniform_filter(good.astype(np.float64), 3, mode="constant")
@@ -203,7 +204,7 @@ def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
 
 
 def _from_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums (H, W, 3) divided by counts (H, W, 1); where a count is 0, the ratio in the smallest block with a count."""
+    """Divides sums (H, W, 3) by counts (H, W, 1). Where a count is 0, takes the ratio in the smallest counted block."""
     mean = total / np.maximum(count, 1)
     if count.all() or count.size == 1:
         return mean

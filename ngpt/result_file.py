@@ -52,7 +52,7 @@ def write_result(
     into: str | None = None,
     reduce: int = 1,
 ) -> None:
-    """Writes the results (H, W, 3) of ``views`` with their stacks, as OpenEXR; or the first result in another format.
+    """Writes the results (H, W, 3) of ``views`` with their stacks as OpenEXR, or only the first in another format.
 
     ``attributes``, ``into`` and ``reduce`` are as for ``ngpt.write``; ``look`` is for pictures.
     """
@@ -69,7 +69,7 @@ def write_result(
 
 
 def check_image(target: Path, transform: str) -> None:
-    """Raises an error if a file cannot hold a result, or if a package for its kind or the transform is missing."""
+    """Raises an error if a file cannot hold a result, or if its kind or the transform needs a missing package."""
     kind = target.suffix.lower()
     if kind not in IMAGES:
         raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")

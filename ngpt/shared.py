@@ -1,17 +1,17 @@
 """Noise that pixels share: the layer ``shared`` of renders whose paths end in a cache.
 
-The layer is a sample with the distribution of that noise. For any weights w of pixels, the expected square of Σ w
-shared is the variance that the cache adds to Σ w primal: in a pixel, in a block, or in the whole image. ``primal_var``
-includes the variance of this noise in each pixel. Merged stacks have the mean of the layers ``shared``, like means of
-all layers.
+The layer is a sample with the distribution of that noise. Let w be weights of pixels: of one pixel, of a block, or of
+the whole image. The expected square of the sum Σ w · shared is then the variance that the cache adds to Σ w · primal.
+``primal_var`` includes the variance of this noise in each pixel. In a merged stack, ``shared`` is the mean of the
+layers ``shared`` of its parts, as ``primal`` is the mean of the layers ``primal``.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-# Header attributes: a sentence on whether paths shared their tails, or why not; and the share of the cache's light that
-# was cut from records that were too bright
+# Header attributes. TAILS says in a sentence whether paths shared their tails (ended in the cache), or why not. CUT is
+# the share of the cache's light that was cut off from records that were too bright.
 TAILS, CUT = "ngpt:tails", "ngpt:tailsCut"
 # Side, in pixels, of the square over which squares of ``shared`` are averaged for a pixel's variance
 _AROUND = 5
@@ -30,7 +30,7 @@ def shared_variance(shared: np.ndarray) -> np.ndarray:
 
 
 def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarray) -> dict[str, dict[str, float]]:
-    """The standard errors of the mean light of the whole image, and of blocks of ``_BLOCK`` pixels if any are whole.
+    """The standard errors of the mean light in the whole image, and in whole blocks of ``_BLOCK`` pixels, if any.
 
     The layers are (H, W, C). "own" is the noise of single pixels, and "shared" is shared noise. Both are root mean
     squares over channels and blocks, relative to the mean light of the image. Values that are not finite count as zero.
@@ -52,10 +52,10 @@ def noise_of_light(primal: np.ndarray, primal_var: np.ndarray, shared: np.ndarra
 
 
 def box_means(image: np.ndarray, size: int) -> np.ndarray:
-    """The mean of ``size`` x ``size`` pixels around each pixel of (H, W), which is mirrored at its edges.
+    """The mean of ``size`` x ``size`` pixels around each pixel of an image (H, W), which is mirrored at its edges.
 
-    The result has the bits of SciPy's ``uniform_filter``, whose import would take longer than all variances of a small
-    render.
+    The result equals that of SciPy's ``uniform_filter`` bit for bit. SciPy is not used, because its import would take
+    longer than computing all variances of a small render.
     """
     if not image.size:  # differences within a single row or column of pixels
         return image

@@ -27,8 +27,8 @@ class GradientStack(Mapping[str, np.ndarray]):
     ``place``       the place of the pixels in the whole picture; without it, they are the whole picture
     ``fine``        layers of subpixels, if there are any (``ngpt.subpixels``)
 
-    All float values are legal, including NaN and Inf. Variances in double precision stay so if float32 cannot hold
-    them, as those of light of 1e30 or 1e-30. The last column of dx and the last row of dy are unused and not changed.
+    All float values are legal, including NaN and Inf. Variances stay in double precision if float32 cannot hold them,
+    as for light of 1e30 or 1e-30. The last column of dx and the last row of dy are unused and not changed.
 
     Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers of different sizes,
     images without pixels, and finite numbers that float32 cannot hold.
@@ -66,8 +66,9 @@ class GradientStack(Mapping[str, np.ndarray]):
     ) -> "GradientStack":
         """Makes a stack from the tensor (H, W, channels) that ``mi.render(scene)`` returns for an integrator of ngpt.
 
-        ``names`` are the integrator's ``aov_names()``, one for each channel: "primal.R". Raises NgptError if their
-        number differs from the number of channels, for unknown layers, and for layers with missing channels.
+        ``names`` are the integrator's ``aov_names()``, one for each channel, such as "primal.R". Raises NgptError if
+        the number of names differs from the number of channels, for unknown layers, and for layers with missing
+        channels.
         """
         array = np.asarray(tensor)
         if array.ndim != 3 or array.shape[2] != len(names):
@@ -140,7 +141,7 @@ class GradientStack(Mapping[str, np.ndarray]):
         return self.layers[name]
 
     def require(self, *names: str, why: str = "") -> None:
-        """Raises NgptError unless the stack has all these layers. ``why`` is who needs them: "method 'l1'"."""
+        """Raises NgptError unless the stack has all these layers. ``why`` says what needs them: "method 'l1'"."""
         missing = [name for name in names if name not in self.layers]
         for name in missing:
             _check_name(name, self.path)

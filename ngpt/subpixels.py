@@ -17,7 +17,7 @@ _LOG = logging.getLogger(__name__)
 
 # The layers that have subpixels
 FINE = ("primal", "albedo", "normal")
-# The layers among these that are stored as half floats, since rounding is far below their noise
+# Of these layers, those that are stored as half floats, because the error of rounding is far below their noise
 HALF = ("albedo", "normal")
 # Header attribute: K, where a file has subpixels
 SUBPIXELS = "ngpt:subpixels"
@@ -28,26 +28,26 @@ FEWEST = 16
 
 
 def subpixels(fine: Mapping[str, np.ndarray], width: int) -> int:
-    """K of the subpixels of an image of this width in pixels; 1 if there are none."""
+    """Returns K for the subpixels of an image that is ``width`` pixels wide; 1 if there are no subpixels."""
     return fine["primal"].shape[1] // width if fine else 1
 
 
 def choice(k: int | str) -> int | str:
-    """The requested ``k``, which may be a text, as a number of ``CHOICES``, or "auto". Raises WrongUse for others."""
+    """Converts ``k``, which may be a text, to a number of ``CHOICES`` or "auto". Raises WrongUse for other values."""
     if (text := str(k)) not in ("auto", *map(str, CHOICES)):
         raise WrongUse(f"'{text}' subpixels cannot be kept; write {', '.join(map(str, CHOICES))}, or auto")
     return text if text == "auto" else int(text)
 
 
 def best(spp: int | None) -> int:
-    """The K that gives OIDN's best image for ``spp`` paths per pixel; None: as many as time allows."""
+    """The K that gives OIDN's best image for ``spp`` paths per pixel; ``spp`` is None for as many as time allows."""
     return 2 if spp is None or spp >= FEWEST else 1
 
 
 def means(layer: np.ndarray, k: int) -> np.ndarray:
-    """The pixels (H, W, C) float32 of a layer (K H, K W, C) of subpixels. A NaN among them makes the pixel NaN."""
+    """The pixels (H, W, C) float32 of a layer (K H, K W, C) of subpixels. A pixel with a NaN subpixel is NaN."""
     total = np.zeros((layer.shape[0] // k, layer.shape[1] // k, *layer.shape[2:]))
-    # Another order of summation could round differently.
+    # The order of summation is fixed, because another order could round differently.
     for i in range(k):
         for j in range(k):
             total += layer[i::k, j::k]
@@ -68,12 +68,12 @@ def stored(name: str, layer: np.ndarray) -> np.ndarray:
 
 
 def cropped(fine: Mapping[str, np.ndarray], window: tuple[slice, slice], k: int) -> dict[str, np.ndarray]:
-    """The subpixels of the pixels in these rows and columns."""
+    """The subpixels of the pixels in the rows and columns of ``window``."""
     return {name: np.ascontiguousarray(layer[within(window, k)]) for name, layer in fine.items()}
 
 
 def within(window: tuple[slice, slice], k: int) -> tuple[slice, slice]:
-    """The rows and columns of the subpixels of the pixels in these rows and columns."""
+    """Converts rows and columns of pixels to the rows and columns of their subpixels."""
     rows, columns = (slice(k * part.start, k * part.stop) for part in window)
     return rows, columns
 

@@ -1,8 +1,8 @@
 """Statistical tests of renderings, for the tests of ngpt and for authors of samplers.
 
-A sampler is right if its mean is right. A single image and a fixed tolerance cannot show this. Independent renders of
-the sampler and of a reference can: their spread gives standard errors, and the number of comparisons sets the
-significance level of each.
+A sampler is right if its mean is right. A single image and a fixed tolerance cannot show this, but independent renders
+of the sampler and of a reference can. The spread of the renders gives standard errors, and the significance level of
+each comparison follows from the number of comparisons.
 """
 
 from dataclasses import dataclass
@@ -44,7 +44,7 @@ def z_test(
 
     ``renders``, ``references``  (batches, H, W, C), at least 8 batches each, rendered with different seeds
     ``block``                    edge, in pixels, of the blocks whose means are compared. Means of blocks are nearly
-                                 normal, which single pixels of path-traced images are not
+                                 normally distributed; single pixels of path-traced images are not
     ``level``                    probability that the test fails for equal means
     ``scale``                    largest value of the images that a layer is computed from, if the layer has smaller
                                  values

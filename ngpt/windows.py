@@ -49,14 +49,14 @@ class Window:
         return f"{self.width}x{self.height} at ({self.left}, {self.top})"
 
     def common(self, other: "Window") -> "Window | None":
-        """The pixels that both have; None if there are none."""
+        """The window of the pixels that both windows have; None if they have no pixel in common."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         width = min(self.left + self.width, other.left + other.width) - left
         height = min(self.top + self.height, other.top + other.height) - top
         return Window(left, top, width, height) if width > 0 and height > 0 else None
 
     def around(self, other: "Window") -> "Window":
-        """The smallest window that holds both."""
+        """The smallest window that holds both windows."""
         left, top = min(self.left, other.left), min(self.top, other.top)
         right = max(self.left + self.width, other.left + other.width)
         bottom = max(self.top + self.height, other.top + other.height)
@@ -103,9 +103,9 @@ class Place:
     def seen_from(self, other: "Place") -> "Window | None":
         """The window of the pixels in the coordinates of ``other``; None if the pictures have different resolutions.
 
-        If only the size of one image is known, and the other has the same size, they are taken to be at the same place,
-        because many programs lose the place of a crop. Otherwise all windows have the same coordinates, unless two
-        display windows have the same corner and different sizes: then the resolutions differ.
+        Many programs lose the place of a crop. So if only the size of one image is known, and the other image has the
+        same size, both are taken to be at the same place. In all other cases, both places are taken to be in the same
+        coordinates, unless their display windows have the same corner and different sizes: then the resolutions differ.
         """
         if self.display != other.display:
             if self.data.size == other.data.size and not (self.known and other.known):
@@ -115,7 +115,7 @@ class Place:
         return self.data
 
     def shift_in(self, other: "Place") -> tuple[int, int] | None:
-        """The column and row of the first pixel in an image at ``other``; None as for ``seen_from``."""
+        """The column and row of the first pixel in an image at ``other``; None if ``seen_from`` returns None."""
         window = self.seen_from(other)
         return None if window is None else (window.left - other.data.left, window.top - other.data.top)
 
@@ -158,7 +158,7 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
 
 
 def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
-    """An image (H, W, C) of ``window`` on the pixels of ``canvas``; ``outside`` is the value of missing pixels.
+    """Puts an image (H, W, C) of ``window`` on the pixels of ``canvas``; ``outside`` is the value of missing pixels.
 
     Raises NgptError for a canvas of more than ``MOST`` pixels, which a damaged header may ask for.
     """
