@@ -2,10 +2,10 @@
 
 Each vertex of the camera path is connected to one vertex of the light path, chosen by its estimated contribution.
 
-Connections to all of its vertices would take half the time of a sample, most of it for little light. A single
-connection, with its light divided by the probability of the choice, has the same mean, so the MIS weights of strategies
-stay the same. It adds less noise if the contributions are guessed well. The guess reads only the records of the light
-path: it evaluates no material and traces no ray.
+Connections to all vertices of the light path would take half the time of a sample, most of it for little light. The
+light of the single connection is divided by the probability of the choice, so its mean is the light of all connections,
+and the MIS weights of strategies stay the same. The choice adds little noise if the contributions are estimated well.
+This estimate reads only the records of the light path: it evaluates no material and traces no ray.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Merges(Protocol):
 
 @dr.syntax
 def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging: Merges | None = None) -> tuple:
-    """L, Le and L_merged of a path from the camera, joined to a ``light_path`` and to photons, if there are any.
+    """Returns L, Le and L_merged of a path from the camera, joined to a ``light_path`` and to photons, if given.
 
     Le is the emission that the camera sees directly, L_merged is the light of photons, and L is all other light.
     """
@@ -111,9 +111,9 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
         met = active & sky.meets(reached)
         Le_met, p, e = emission_at(scene, lights, reached, si if edge is None else edge.seen_by(si), met)
         if dr.hint(edge is not None, mode="scalar"):
-            # No emitter is sampled from the camera itself.
+            # The first edge begins at the camera, and no emitter is sampled from the camera itself.
             p, e = dr.select(edge.first, 0, p), dr.select(edge.first, 0, e)
-        # Light paths are not that long, so they find no such path.
+        # Light paths find no path of more than ``longest`` edges.
         end.vc = dr.select(depth <= plan.longest, end.vc, 0)
         L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
         si = reached
@@ -123,13 +123,15 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
 
 
 def known(end: Partial, joined: mi.Bool) -> Partial:
-    """The partial sums at a vertex. Paths too long for light paths are weighted as if there were no light paths."""
+    """Returns the partial sums at a vertex. Where the path is too long to be ``joined`` to light paths, it is weighted
+    as if there were no light paths.
+    """
     return Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
 
 
 @dr.syntax
 def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi.Float) -> Any:
-    """Estimates the light of all connections of ``z`` to a light path by one connection. ``u`` chooses it."""
+    """Estimates the light of all connections of ``z`` to a light path from one connection, which ``u`` chooses."""
     L = dr.zeros(mi.Spectrum, dr.width(z.depth))
     chosen, times = choose(z, active, light_path, plan.longest, u)
     if active & (times > 0):
@@ -139,13 +141,14 @@ def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi
     return L
 
 
-# Added to cosines: a shading normal may face light when the geometric one does not, and glossy materials are not matte.
+# Added to cosines, because a shading normal may face light when the geometric normal does not, and because glossy
+# materials do not scatter like matte ones
 _LEAST_COSINE = 0.1
 
 
 @dr.syntax
 def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
-    """The number of the chosen vertex of ``light``, and 1 / the probability of that choice, or 0 if there is none.
+    """Returns the number of the chosen vertex of ``light``, and 1 / the probability of the choice (0: no vertex).
 
     The random number ``u`` chooses among vertices whose connection makes a path of at most ``longest`` edges.
     """
@@ -169,9 +172,10 @@ def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
 
 
 def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
-    """The light of the connection from ``z`` to the record ``y`` times its MIS weight, as if both were white and matte.
+    """Estimates the light of the connection from ``z`` to the record ``y``, times the MIS weight of this connection.
 
-    ``come_from`` is the cosine of the direction from ``z`` to its previous vertex.
+    The estimate takes both vertices for white and matte. ``come_from`` is the cosine of the direction from ``z`` to its
+    previous vertex.
     """
     to = mi.Vector3f(y.o + y.d * y.t - z.si.p)
     distance2 = dr.squared_norm(to)

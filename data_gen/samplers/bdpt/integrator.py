@@ -1,18 +1,21 @@
-r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
+r"""Bidirectional path tracing: each camera sample traces a path from the camera and one from a light, and joins them.
 
 Every way to find a path is a strategy. MIS weights combine all strategies (``mis``). Each vertex of the camera path is
-connected to a lamp and to one vertex of the light path, which stands for all its vertices (``camera_path.choose``).
+connected to a lamp and to one vertex of the light path, which stands for all vertices of the light path
+(``camera_path.choose``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced
-    β                 throughput f / p of either
-    p, q              density of a sampled direction, and of the same with both directions swapped
-    others            Σ p_j / p_s over all other strategies
+    s                 the number of a path's vertices that come from the light; each s is a strategy
+    β                 throughput f / p of either path
+    p, q              density of sampling a direction, and the same with both directions of the vertex swapped
+    others            Σ p_j / p_s over all strategies j other than s, the strategy that found the path
     L, Le             radiance of the camera path: Le is emission that the camera sees directly, L is all other light
 
-Both paths are made in one kernel. A light path that reaches the camera may end on any pixel. It is splatted, so only
-samples of different passes are independent. Paths of more than ``joined_depth`` edges are found only from the camera,
-by s = 0 and s = 1. This limits the memory for a light path, but not the length of paths.
+Both paths are made in one kernel. A light path that reaches the camera may end on any pixel, to which its light is
+added (splatted). So samples of the same pass are not independent of each other. Paths of more than ``joined_depth``
+edges are found only from the camera, by the strategies s = 0 and s = 1. This limits the memory for a light path, but
+not the length of paths.
 
 [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", chapter 10]
 """
@@ -61,8 +64,8 @@ class BDPT(GradientIntegrator):
     """Bidirectional path tracing, for surfaces; no gradients.
 
     Plugin ``bdpt``, with the parameters of Mitsuba's ``path`` and ``joined_depth``. Not handled: media, polarised
-    variants, cameras that are neither perspective nor thin lenses, emitters other than areas, points, spots and those
-    infinitely far away. Rendering raises NgptError for them.
+    variants, the material ``hair``, cameras that are neither perspective nor thin lenses, emitters other than areas,
+    points, spots and those infinitely far away. Rendering a scene with any of these raises NgptError.
     """
 
     plan_class = Plan
@@ -98,7 +101,7 @@ class BDPT(GradientIntegrator):
         film.put_all(values)
 
     def samples(self, plan: Plan, camera: CameraSamples, sums: tuple = ()) -> tuple[dict, tuple]:
-        """The layers, and the ``sums`` of splats, to which the splats of light paths are added if there are any."""
+        """Returns the layers, and the ``sums`` of splats with the splats of light paths added, if there are any."""
         sight, lit = Sight.of(camera), None
         if plan.joins:
             splatter = Splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
@@ -111,7 +114,7 @@ class BDPT(GradientIntegrator):
         return values, sums
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
-        """Whether something is between ``si`` and the camera's near plane. Hidden lamps do not count."""
+        """Whether the camera's near plane does not see ``si``. Hidden lamps block nothing, and are not seen."""
         if not self.hide_emitters:
             return scene.ray_test(si.spawn_ray_to(camera.p), active)
         on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers

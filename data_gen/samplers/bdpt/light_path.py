@@ -31,7 +31,7 @@ class Seen:
     """A light path up to a vertex, joined to the camera."""
 
     y: Vertex
-    C: mi.Spectrum  # 0 where the camera does not see it
+    C: mi.Spectrum  # f / p of the whole path; 0 where the camera does not see ``y``
     others: mi.Float
     pixel: mi.UInt32
     kept: Any  # the record of ``y``
@@ -65,8 +65,8 @@ class LightPath:
 
 
 def begin(plan: Plan, random, camera_ray: mi.Ray3f) -> tuple[LightRay, End, mi.Bool]:
-    """The start and first vertex of a light path, and whether it exists; ``camera_ray`` has its time and
-    wavelengths."""
+    """Returns the start and the first vertex of a light path, and whether this vertex exists. The path has the time and
+    the wavelengths of ``camera_ray``."""
     scene, lights = plan.scene, plan.lights
     start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
     active = dr.max(start.β) > 0
@@ -83,15 +83,18 @@ def lit(plan: Plan, start: LightRay, si: mi.SurfaceInteraction3f) -> mis.Partial
 
 
 def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple:
-    """The next vertex after ``y``, whether it exists, the event that leads there, and 1 / the survival probability."""
+    """Returns the next vertex after ``y`` with the edge to it, whether this vertex exists, the event at ``y`` that
+    leads to it, and 1 / the survival probability.
+    """
     u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
     sample, f_p = bsdf.sample(context(IMPORTANCE), y.si, u_lobe, u_direction, active)
     known = replace(y, end=plan.known(y.end, bsdf))
     d, f_p, end = light_leaves(known, bsdf, sample, f_p, active & (sample.pdf > 0))
-    # The partial sums behind a hole must not include photons gathered at the hole.
+    # The partial sums behind a hole must not include photons gathered at the hole. So this call gets ``y``, and not
+    # ``known``.
     end, edge = plan.onward(y, bsdf, sample, end)
     β = y.β * dr.select(sample.pdf > 0, f_p, 0)
-    # Russian roulette by the share of the path's initial light that is left
+    # Russian roulette depends on the share of the path's initial light that is left.
     survives = roulette(dr.max(β) * dr.rcp(dr.max(start.β)), y.depth >= plan.limits.rr_depth)
     active = active & (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survives)
     ray = y.si.spawn_ray(d)
@@ -99,7 +102,7 @@ def go_on(plan: Plan, random, start: LightRay, y: Vertex, bsdf, active) -> tuple
     si = hit.compute_surface_interaction(ray)
     end = plan.arrives(end, edge, si, d)
     if edge is not None:
-        # The partial sums of the first edge depend on its whole length, through any holes.
+        # The partial sums behind the first edge depend on its whole length, even if it leads through holes.
         first = lit(plan, start, si)
         end = mis.Partial(dr.select(edge.first, first.vcm, end.vcm), dr.select(edge.first, first.vc, end.vc))
     there = End(ray, hit, Vertex(si, β / survives, end, y.depth + 1, edge))
@@ -124,8 +127,8 @@ def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, A
         smooth = active & scatters_smoothly(bsdf)
 
         # ------------------------- Keep --------------------------
-        # Each vertex is kept at the index of its depth, smooth or not. Dr.Jit 1.5 (LLVM) gives wrong results if the
-        # indices of lanes differ, or if this loop reads the array.
+        # Each vertex is kept at an index that is its depth - 1, even if nothing can be connected to it. Dr.Jit 1.5
+        # (LLVM) gives wrong results if the indices of lanes differ, or if this loop reads the array.
         here = record(end.ray, end.hit, y, smooth)
         kept.write(here, y.depth - 1, active)
         count = dr.select(active, y.depth, count)

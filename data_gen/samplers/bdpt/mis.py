@@ -1,30 +1,33 @@
 r"""MIS weights of all strategies that find a path: the balance heuristic, computed by recursion along both subpaths.
 
-A path x0 (camera) x1 ... xk (light) is found by k + 1 strategies: s of its vertices come from the light, the others
-from the camera. With p_s the density of strategy s, its weight is p_s / Σ p_j = 1 / (1 + others), where
+A path x0 (camera) x1 ... xk (light) is found by k + 1 strategies. In strategy s, s vertices of the path come from the
+light and the others from the camera. If p_s is the density of strategy s, its weight is p_s / Σ p_j = 1 / (1 + others),
+where
 
     others = Σ_{j≠s} p_j / p_s = the strategies with a longer light path + those with a longer camera path.
 
-Each subpath updates its own sum from vertex to vertex, without storing the densities (Georgiev 2012, "Implementing
-Vertex Connection and Merging"):
+Each subpath updates its own part of this sum from vertex to vertex, without storing the densities (Georgiev 2012,
+"Implementing Vertex Connection and Merging"). It keeps two partial sums:
 
     vcm   1 / the density of the last vertex: the first summand without its factors that are still unknown
     vc    the sum of all further summands, also without these factors
 
 Densities do not include Russian roulette, so weights depend only on the path. Camera and light have the same formula
-for their first edge, with e = p_emit / (p_connect cos). This is the density of sampling the first edge from the end of
-the path, divided by the density of choosing that end for a connection, per unit area facing the end. A connection
-cannot make a delta event: its summands are 0, and in later summands the densities of its two directions cancel.
+for their first edge, with e = p_emit / (p_connect cos). e is a quotient of two densities, per unit area facing the end
+of the path (the camera or a lamp): the density of sampling the first edge from this end, and the density of choosing
+this end for a connection. A connection cannot make a delta event. So the summands of a delta event are 0, and in later
+summands the densities of its two directions cancel.
 
 Holes that connections go through are no vertices: an edge leads through them, and its length is measured from vertex to
-vertex. If a path passes a hole by chance, the probability is a factor of its weight and not of its density, as for a
-connection.
+vertex. If a path passes a hole by chance, the probability of passing is no part of the path's density: the hole
+attenuates the light of the path, as it does for a connection.
 
-Both subpaths may also arrive at one vertex and merge. The density of a merge is the product of the subpaths' densities
-times η = π r² N, for N light paths and radius r. Paths merge only at vertices where photons are gathered, and only if
-the light came from a delta event; otherwise a connection finds the path without blur. A light path knows this at the
-vertex: its ``vcm`` is 0 there, and ``gathered`` adds η as one more summand. A camera path knows it only when it leaves
-the next vertex, so η is ``waiting`` until then. Without photons the formulas are the same as in ``bdpt``.
+Both subpaths may also arrive at the same vertex and merge there (``vcm``). The density of a merge is the product of the
+subpaths' densities times η = π r² N, for N light paths and radius r. Paths merge only at vertices where photons are
+gathered, and only if the light came to the vertex from a delta event; all other paths are found by connections, without
+blur. A light path knows at the vertex whether it came from a delta event: ``vcm`` is 0 then, and ``gathered`` adds η as
+one more summand. A camera path knows it only when it leaves the next vertex, so η is ``waiting`` until then. Without
+photons η is left out, as in ``bdpt``.
 
 ``p`` are densities in solid angle, and ``q`` are densities with both directions of the vertex swapped. Cosines are
 absolute, to the geometric normal. Quotients are computed one by one, because squares of densities would leave the range
@@ -50,33 +53,33 @@ class Partial:
 
 
 def begin_camera(e: mi.Float, cos: mi.Float) -> Partial:
-    """At the first vertex that the camera sees. No strategy meets the camera by chance."""
+    """The sums at the first vertex that the camera sees. No strategy meets the camera by chance, so ``vc`` is 0."""
     return Partial(dr.rcp(e * cos), mi.Float(0))
 
 
 def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Partial:
-    """At the first vertex of a light path; ``p`` is the density of connecting that vertex to the light's end."""
+    """The sums at the first vertex of a light path; ``p`` is the density of connecting this vertex to the lamp."""
     return Partial(dr.rcp(e * cos), dr.select(delta, 0, dr.rcp(e * p * cos)))
 
 
 def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0) -> Partial:
-    """Behind an event that was sampled with density ``p``. For camera paths, ``η`` is the η of the vertex."""
+    """The sums behind an event that was sampled with density ``p``. For camera paths, ``η`` is that of the vertex."""
     vc = dr.select(delta, (end.vc + end.waiting) * cos, cos / p * (end.vcm + end.vc * q))
     return Partial(dr.select(delta, 0, dr.rcp(p)), vc, dr.select(delta, 0, mi.Float(η) * (cos / p)))
 
 
 def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
-    """At the next vertex, at the end of an edge of squared length ``distance2``."""
+    """The sums at the next vertex, at the end of an edge of squared length ``distance2``."""
     return Partial(end.vcm * distance2 / cos, end.vc / cos, end.waiting * dr.rcp(cos))
 
 
 def passed(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
-    """Behind a hole, which is no vertex: undoes ``arrive()`` there."""
+    """The sums behind a hole, which is no vertex: undoes ``arrive()`` at the hole."""
     return Partial(end.vcm * (cos / distance2), end.vc * cos, end.waiting * cos)
 
 
 def gathered(y: Partial, η: mi.Float) -> Partial:
-    """At a vertex of a light path, with the summand of merging; η is 0 where no photons are gathered."""
+    """The sums at a vertex of a light path, with the summand of merging; η is 0 where no photons are gathered."""
     return Partial(dr.select(y.vcm > 0, y.vcm, η), y.vc)
 
 

@@ -25,7 +25,7 @@ class Plan(World):
     limits: Limits
     longest: int  # the number of edges up to which paths are found from both ends
     first_hit: Callable  # (scene, ray, active): where a ray from the camera leads
-    hidden: Callable  # (scene, vertex, direction toward the camera, active): whether something is between the two
+    hidden: Callable  # (scene, vertex, direction to the camera, active): whether the camera does not see the vertex
     η: mi.Float | None = None  # of ``mis``; None if no photons are gathered
 
     @property
@@ -56,7 +56,7 @@ class Plan(World):
         return self.carried(passed, x, end), x.edge.behind(passed, x.si)
 
     def carried(self, passed: mi.Bool, x: Vertex, end: Partial) -> Partial:
-        """``end`` behind ``x``, or ``end`` before ``x`` if the path has ``passed`` a hole there."""
+        """``end``, the partial sums behind ``x``; where the path has ``passed`` a hole at ``x``, those before ``x``."""
         same = mis.passed(x.end, cosine(x.si, x.si.to_world(x.si.wi)), x.edge.length2(x.si))
         parts = ((getattr(same, name), getattr(end, name)) for name in ("vcm", "vc", "waiting"))
         return Partial(*(dr.select(passed, a, b) for a, b in parts))

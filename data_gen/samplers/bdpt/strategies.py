@@ -5,7 +5,7 @@
     connected   s, t > 1: the last vertex of the camera path is connected to a vertex of the light path
     to_camera   t = 1: a vertex of the light path is connected to the camera
 
-Each returns f / p of the path that it completes, and ``others`` of ``mis``: its weight is 1 / (1 + others).
+Each returns f / p of the path that it completes, and ``others`` of ``mis``: the path's weight is 1 / (1 + others).
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, 
 
 
 def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """Le at ``si`` toward ``ref`` where ``active``, the density of connecting ``ref`` to it, and ``e`` of ``mis``."""
+    """Returns Le at ``si`` toward ``ref`` where ``active``, the density of connecting ``ref`` to ``si``, and ``e`` of
+    ``mis``.
+    """
     light, p = lights.met(scene, si, ref, active)
     Le = light.emitter.eval(si, active)
     cos = dr.abs(dr.dot(light.n, light.d))
@@ -34,7 +36,9 @@ def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum,
 
 
 def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[mi.Spectrum, mi.Float]:
-    """s = 1. ``light`` and its ``weight`` Le / p are Mitsuba's; f, p and q are from ``evaluate`` toward it."""
+    """s = 1. ``light`` and its ``weight`` Le / p come from Mitsuba. f, p and q are as from ``evaluate``, for the
+    direction to the light.
+    """
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
@@ -50,7 +54,8 @@ def connected(plan: Plan, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spec
 def connection(
     plan: Plan, z: Vertex, z_bsdf, y: Vertex, active, sees: Callable | None = None
 ) -> tuple[mi.Spectrum, Connection, tuple[Any, Any]]:
-    """f / p without the camera path's throughput; the edge, for the MIS weight; T of holes and their number.
+    """Returns f / p without the camera path's throughput; the edge, for the MIS weight; and a pair (T, number of
+    holes), where T is the transmittance of the holes between the vertices.
 
     ``sees(z, y, active)``, if given, replaces ``plan.sees`` to find T and the number of holes.
     """
@@ -60,7 +65,7 @@ def connection(
     f, p_z, q_z = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(d), active)
     g, p_y, q_y = evaluate(IMPORTANCE, y.si, y.si.bsdf(), y.si.to_local(-d), active)
     C = y.β * f * g / distance2
-    # Two vertices at one place make no path: its density would be infinite.
+    # Two vertices at the same place make no path: its density would be infinite.
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
     T, holes = sees(z, y, lit) if sees else plan.sees(z.si, y.si.p, plan.longest - 1 - z.depth - y.depth, lit)
     C = dr.select(lit, C * T, 0)

@@ -14,7 +14,7 @@ from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 
-# Names, since Mitsuba's own values belong to a variant
+# These are names, because Mitsuba's own values belong to a variant.
 RADIANCE, IMPORTANCE = "Radiance", "Importance"
 
 
@@ -40,9 +40,9 @@ def record_class(variant: str) -> type:
 
     @dataclass
     class Record:
-        """The record of a vertex of a light path: 23 words in RGB. It has no Bool, with which Dr.Jit 1.5 fails.
+        """The record of a vertex of a light path: 23 words in RGB. No field is a Bool, because Dr.Jit 1.5 fails then.
 
-        The interaction is computed again from the ray that led there and its hit.
+        ``recall`` computes the interaction again from the ray that led to the vertex and from the hit of this ray.
         """
 
         o: mi.Point3f
@@ -62,7 +62,9 @@ def record_class(variant: str) -> type:
 
 
 def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Any:
-    """The record of a ``vertex`` that ``ray`` has hit. Its depth is 0 if nothing can be connected to it."""
+    """The record of a ``vertex`` that ``ray`` has hit. The record's depth is 0 where the vertex is not ``smooth``, so
+    that nothing can be connected to it.
+    """
     return record_class(mi.variant())(
         o=mi.Point3f(ray.o),
         d=mi.Vector3f(ray.d),
@@ -96,7 +98,9 @@ def scatters_smoothly(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 
 def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """f cos for a path that goes on along ``wo`` (local), the density p of ``wo``, and q with directions swapped."""
+    """Returns f cos for a path that goes on along ``wo`` (local), the density p of ``wo``, and q, the density with both
+    directions swapped.
+    """
     if mode == IMPORTANCE:
         f, q = light_scattered(si, bsdf, wo, active)
         p = bsdf.pdf(context(RADIANCE), si, wo, active)
@@ -108,7 +112,7 @@ def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum,
 
 
 def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
-    """Density of sampling the direction to the previous vertex, if the path arrived along ``wo`` instead."""
+    """Returns the density of sampling the direction to the previous vertex, had the path arrived along ``wo``."""
     q = bsdf.pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
     return dr.select(dr.isfinite(q), q, 0)
 
@@ -116,10 +120,10 @@ def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
 def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos of light that leaves along ``wo``, and the density with both directions swapped.
 
-    It is f of radiance in the opposite direction, times cos_g(wo) / cos_g(wi). So camera paths and light paths agree on
-    f of a path, whatever shading normals a material has. Mitsuba's own f for light is not used: with bump and normal
-    maps it has the cosine of the wrong direction. [Veach 1997, "Robust Monte Carlo Methods for Light Transport
-    Simulation", section 5.3.2]
+    The value is that of radiance in the opposite direction, times cos_g(wo) / cos_g(wi), with cosines to the geometric
+    normal. So camera paths and light paths agree on f of a path, whatever shading normals a material has. Mitsuba's own
+    f for light is not used: with bump and normal maps it has the cosine of the wrong direction. [Veach 1997, "Robust
+    Monte Carlo Methods for Light Transport Simulation", section 5.3.2]
     """
     f, q = bsdf.eval_pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
     f *= _quotient(cosine(si, si.to_world(wo)), cosine(si, si.to_world(si.wi)))
@@ -130,8 +134,8 @@ def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.
 def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -> tuple[mi.Spectrum, mi.Float]:
     """f cos / p of light that leaves by a sampled event, and the density with both directions swapped.
 
-    ``f_p`` is Mitsuba's for IMPORTANCE. For mirrors and glass it lacks a ratio of cosines. These cosines are to the
-    half-vector, which is the normal of the mirror, whatever the shape's normal is.
+    ``f_p`` is Mitsuba's value for IMPORTANCE. For mirrors and glass this value lacks a ratio of cosines. They are the
+    cosines to the half-vector, which is the normal of the mirror, whatever the shape's normal is.
     """
     smooth = event_kind(sample.sampled_type) == SMOOTH
     f, q = light_scattered(si, bsdf, sample.wo, active & smooth)

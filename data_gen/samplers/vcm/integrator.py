@@ -2,13 +2,14 @@ r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one sampler, combined
 
     s, t        the number of vertices of a path that come from the light, and from the camera
     z, y        vertices of the camera path and of light paths
-    r, η        the radius of a pass, and π r² N with N light paths in the pass
+    r, η        the radius of gathering in a pass, and π r² N with N light paths in the pass
 
 A pass has one camera sample and one light path for each pixel. Light paths are traced once. Their vertices are
-connected to the camera (splats) and kept in a map. One of them is connected to each vertex of the same sample's camera
-path (``bdpt.camera_path``). They are also gathered as photons, within the radius, at the vertices of all camera paths
-where materials scatter widely. Only vertices that light reaches from mirrors or clear glass are gathered
-(docs/samplers/photons.md). Their light is the layer ``caustic`` (``ngpt.layers.GATHERED``).
+connected to the camera (splats) and kept in a map. Each vertex of a camera path is connected to one vertex of the same
+sample's light path (``bdpt.camera_path``). The vertices of all light paths are also gathered as photons, within the
+radius, at the vertices of camera paths where materials scatter widely. Only vertices that light reaches from mirrors or
+clear glass are photons (docs/samplers/photons.md). The light of photons is the layer ``caustic``
+(``ngpt.layers.GATHERED``).
 
 [Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
 Space Extension for Robust Light Transport Simulation"]
@@ -46,9 +47,9 @@ SAMPLE_BYTES = 1536
 class VCM(BDPT):
     """Vertex connection and merging, for surfaces; no gradients.
 
-    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. Biased and consistent, as
-    ``ppm``, but only for light that comes through glass or by mirrors. Not handled: media, polarised and spectral
-    variants, and what ``bdpt`` does not handle. Rendering raises NgptError for them.
+    Plugin ``vcm``, with the parameters of Mitsuba's ``path`` and the options of its entry. It is biased and consistent,
+    as ``ppm`` is, but the bias is only in light that comes through glass or from mirrors. Not handled: media, polarised
+    and spectral variants, and what ``bdpt`` does not handle. Rendering a scene with any of these raises NgptError.
     """
 
     # The visitor that receives light paths that end at the camera
@@ -62,7 +63,7 @@ class VCM(BDPT):
     @property
     def lane_bytes(self) -> int:
         """Bytes of a camera sample, with the largest map of its light path."""
-        # Dr.Jit gives each array the next power of two of bytes.
+        # Dr.Jit rounds the size of each array up to a power of two.
         places = 1 << (self.vertices - 1).bit_length() if self.vertices else 0
         return self.sample_bytes + places * VERTEX_BYTES
 
@@ -115,7 +116,7 @@ class VCM(BDPT):
     # ------------------------ Camera paths: joins, and merges ------------------------
 
     def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple:
-        """L, Le and L_merged of camera paths, joined to their own light paths and to all ``photons``."""
+        """Returns L, Le and L_merged of camera paths, joined to their own light paths and merged with ``photons``."""
         sight = replace(sight, random=sight.random.clone())
         if photons is None:
             return camera_path(self.plan(world), sight, None)

@@ -1,8 +1,9 @@
 """The map of the light paths of a pass, and merging: gathering its photons at camera paths.
 
 All photons within the radius r are gathered at z, the last vertex of a camera path, whichever light path they belong
-to. Each of them completes a path. The density of this path is η = π r² N times the product of the densities of its
-camera path and its light path. So ``mis`` can weight it against all connections of the same path.
+to. Each photon completes a path. The density of this path is η = π r² N times the product of the densities of its
+camera path and its light path, where N is the number of light paths in the pass. So ``mis`` can weight the merge
+against all connections that make the same path.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from data_gen.samplers.photons.map.radius import spread
 from data_gen.samplers.photons.map.trace import empty_map
 from data_gen.samplers.photons.map.vertices import Photon, at, faces, put
 
-# Bytes of a vertex: 23 words of a record, one for whether it is a photon, and 12 words while the grid is made.
+# Bytes of a vertex: 23 words of a record, a word that says whether it is a photon, and 12 words while the grid is made.
 VERTEX_BYTES = (23 + 1 + 12) * 4
 
 
@@ -71,7 +72,7 @@ class Keeper:
     def sees(self, state: Any, seen: Seen) -> Any:
         place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
         put(self.kept.vertices, seen.kept, place, here)
-        # ``Plan.known`` has set vcm to η there.
+        # Where photons are gathered, ``Plan.known`` has set vcm to η.
         photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
         dr.scatter(self.kept.photon, photon, place, here)
         return self.splatter.sees(state, seen)
@@ -84,7 +85,7 @@ class Photons:
     kept: Map
     grid: Grid
     radius2: mi.Float
-    K: mi.Float
+    K: mi.Float  # the kernel, 1 / η
     η: mi.Float
     number: mi.UInt32  # of the pass
 
@@ -97,7 +98,7 @@ class Photons:
 
 
 class Merging:
-    """Merges camera paths with photons, if both have at most ``plan.longest`` edges together: ``bdpt``'s ``Merges``."""
+    """``Merges`` of ``bdpt``. A camera path and a photon merge if together they have at most ``plan.longest`` edges."""
 
     def __init__(self, photons: Photons, plan: Plan):
         self.photons, self.plan, self.materials, self.longest = photons, plan, plan.materials, plan.longest
@@ -117,7 +118,7 @@ class Merging:
         return photons.K * L * self.spread(z.si, active & (dr.max(L) > 0))
 
     def spread(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """A factor of the kernel K at a vertex, since there is less area near edges. MIS weights do not include it."""
+        """A factor of the kernel K at ``x``: near edges, photons lie on less area. MIS weights do not include it."""
         return spread(self.plan, x, self.photons.radius2, self.photons.number, active)
 
     def photon(self, i: mi.UInt32, z: Vertex, near: mi.Bool) -> tuple[Photon, Partial, mi.Bool]:
@@ -140,12 +141,14 @@ class Merging:
 
 
 def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
-    """The radiance that a ``photon`` adds at ``si``, without the kernel; p of the direction to the light; q."""
+    """Returns the radiance that a ``photon`` adds at ``si``, without the kernel, the density p of the direction to the
+    light, and the density q of the direction to the camera.
+    """
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
     # f contains the shading cosine, but the density of photons follows the geometric one.
     return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q
 
 
 def eta(radius: float, paths: int) -> float:
-    """η of ``mis``."""
+    """Returns η of ``mis``: π r² N for N light ``paths``."""
     return float(np.pi * radius**2 * paths)
