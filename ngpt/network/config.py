@@ -1,7 +1,7 @@
 """The configuration of a network: the table [model] of a TOML file, which is also in the header of weights.
 
-``ModelConfig`` holds its fields, and makes the checks that all kinds of networks share. Each kind of network has a
-``Kind``, which makes further checks, and creates the network.
+``ModelConfig`` holds the fields of this table, and makes the checks that all kinds of networks share. Each kind of
+network has a ``Kind``, which makes further checks, and creates the network.
 """
 
 import math
@@ -18,7 +18,7 @@ from ngpt.network.heads import Head, head_of
 from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 from ngpt.system.parts import Registry
 
-# Limits of what a file may contain: far more than networks need, and far too little to exhaust a machine.
+# Limits on the numbers in a file. They allow far more than networks need, and far too little to exhaust a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Kernels must not reach beyond the padding.
 MAX_KERNEL = 2 * padding.MARGIN + 1
@@ -98,9 +98,9 @@ class ModelConfig:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers that the inputs are, or are computed from.
+        """The layers that are inputs themselves, or from which inputs are computed.
 
-        A stack holds them, or ``ngpt.network.inputs`` makes them.
+        Each of these layers is in the stack, or ``ngpt.network.inputs`` makes it.
         """
         names = features.sources(self.inputs)
         # The exposure is computed from the primal.
@@ -113,7 +113,7 @@ class ModelConfig:
 
     @property
     def reads_gradients(self) -> bool:
-        """Whether the network reads gradients. Then it works on the light that they describe (``ngpt.repair``)."""
+        """Whether the network reads gradients. If so, its images exclude the layer ``caustic``, as gradients do."""
         return "dx" in self.needs
 
     def to_dict(self) -> dict[str, Any]:
@@ -127,7 +127,7 @@ class Kind(ABC):
 
     @abstractmethod
     def check(self, config: ModelConfig) -> None:
-        """Raises NgptError for an invalid configuration of such a network."""
+        """Raises NgptError for an invalid configuration of a network of this kind."""
 
     @abstractmethod
     def head(self, config: ModelConfig) -> Head:

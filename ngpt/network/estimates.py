@@ -9,12 +9,12 @@ from ngpt.system.late import ndimage
 
 
 def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
-    """The stack with variances of image, dx and dy; those that it lacks are estimated.
+    """The stack with variances of image, dx and dy. Variances that the stack lacks are estimated.
 
     ``image`` (H, W, 3) is a reconstruction with little noise, without direct emission. The estimate is the squared
     difference between a layer and this image (or its pixel differences), averaged twice over 3 x 3 pixels. Detail that
-    the reconstruction blurs counts as noise of the gradients: then they are trusted too little rather than too much
-    (docs/lab/log/2026-W47.md, "what auto takes").
+    the reconstruction blurs counts as noise of the gradients. So gradients are trusted too little there, rather than
+    too much (docs/lab/log/2026-W47.md, "what auto takes").
     """
     noise = data.noise
     if noise is None:

@@ -1,4 +1,4 @@
-"""Statistics of an image that all of its tiles share when a network reconstructs them."""
+"""Statistics of a whole image. If a network reconstructs the image in tiles, every tile gets the same statistics."""
 
 from collections.abc import Mapping
 
@@ -16,9 +16,9 @@ _BAND = 256
 def statistics(layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """(5,) float32: exposure, largest depth, least radiance (at most 0), largest radiance (at least 0), and 0.
 
-    ``layers`` (H, W, C) are ``primal``, and ``depth`` if there is one. Values that are not finite count as 0. The
-    exposure is the same as by ``ngpt.network.features.exposure``. The last entry stands for the mean variance, which
-    only a graph that makes the base itself needs (export/CONTRACT.md).
+    ``layers`` holds the arrays (H, W, C) ``primal`` and, optionally, ``depth``. Values that are not finite count as 0.
+    The exposure equals that of ``ngpt.network.features.exposure``. The last entry stands for the mean variance. Only a
+    graph that computes the base itself needs this variance (export/CONTRACT.md).
     """
     primal, low, high, means = layers["primal"], 0.0, 0.0, []
     for top in range(0, len(primal), _BAND):

@@ -5,27 +5,29 @@
     albedo       3   unchanged, [0, 1]
     normal       3   unchanged, camera space, [-1, 1]
     diffuse, specular
-                 3   as primal: light by the lobe of its first scattering event
+                 3   as primal: the light, split by the lobe of its first scattering event
     depth        1   divided by the largest depth of the image, [0, 1]; 0 where the path escapes
     base         3   as primal: a classical reconstruction that the network starts from
     denoised, denoised_base
                  3   as primal: another denoiser's images of the primal and of the base (``ngpt.network.inputs``)
     primal_se, dx_se, dy_se, diffuse_se, specular_se
-                 1   ln(1 + standard error of the layer of that name, mean over RGB)
+                 1   ln(1 + e), with e the standard error of that layer, averaged over RGB
 
-The following channels are relative to an image D, and enlarged so that 16 bits can hold small differences. L is the
-signed log. D is the base if "base" is among the inputs, otherwise the denoised image:
+L is the signed log, sgn(x) ln(1 + |x|). The following channels are relative to an image D: the base if "base" is among
+the inputs, otherwise the denoised image. Differences are multiplied by 20 and noise by 100, so that 16 bits can hold
+small values:
 
     primal_change, base_change, denoised_base_change
                  3   L(20 (L(x) - L(D)))
     dx_base, dy_base, dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
-                 3   L(20 (dx - ΔX) / (1 + |D|)), with X the image in the name: 0 where X agrees with the gradients
+                 3   L(20 (dx - ΔX) / (1 + |D|)). X is the image in the name, ΔX its pixel differences; 0 where X agrees
+                     with the gradients
     primal_noise, dx_noise, dy_noise
-                 1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
+                 1   ln(1 + 100 e / (1 + d)), with e the standard error and d = |D|, both averaged over RGB
 
-[Kettunen et al. 2019, section 4.2 and their code; the base and standard errors are not in the paper.] Before, radiance
-is divided by the exposure. A network gets only the layers in its configuration: missing layers are never replaced by
-zeros.
+[Kettunen et al. 2019, section 4.2 and their code; the base and standard errors are not in the paper.] Before encoding,
+radiance is divided by the exposure. A network gets only the layers in its configuration: missing layers are never
+replaced by zeros.
 """
 
 from collections.abc import Mapping
@@ -50,13 +52,14 @@ CHANNELS = {
     )
 }
 
-# Factors of differences to an image and of relative noise; a number that is added to the divisor of depth.
+# Factors by which differences to D and relative noise are multiplied; and a number that is added to the divisor of
+# depth, so that it is never 0.
 ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 
-# Added to the albedo before radiance is divided by it, because dark surfaces have gloss, too.
+# Radiance is divided by albedo + GLOSS, because surfaces with a dark albedo may still reflect light as gloss.
 GLOSS = 0.1
 
-# Computed layer -> the layers that it is computed from, in addition to ``compared``.
+# Computed layer -> the layers from which it is computed, besides the image D (``compared``).
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
     **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *DENOISED)},
@@ -82,7 +85,7 @@ def channels(inputs: tuple[str, ...]) -> int:
 
 
 def sources(inputs: tuple[str, ...]) -> tuple[str, ...]:
-    """The layers that these inputs are or are computed from."""
+    """The layers that are inputs themselves, or from which inputs are computed."""
     beside = (compared(inputs),)
     return tuple(
         dict.fromkeys(source for name in inputs for source in (SOURCES[name] + beside if name in SOURCES else (name,)))
@@ -95,7 +98,7 @@ def compared(inputs: tuple[str, ...]) -> str:
 
 
 def completed(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
-    """The normalised layers, with the ``inputs`` that are computed from them; before any padding."""
+    """The normalised ``layers``, not yet padded, and those of the ``inputs`` that are computed from them."""
     return dict(layers) | {name: _computed(name, layers, compared(inputs)) for name in inputs if name in SOURCES}
 
 
@@ -115,7 +118,7 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 def reflectance(albedo: Tensor) -> Tensor:
     """The divisor of radiance (N, 3, H, W) for demodulation: albedo + ``GLOSS``.
 
-    Because of the addend, a noisy albedo between 0 and 0.1 changes the demodulated light little.
+    Because ``GLOSS`` is added, noise in an albedo between 0 and 0.1 changes the quotient little.
     """
     return albedo + GLOSS
 
@@ -142,9 +145,9 @@ def _encoded(name: str, layer: Tensor) -> Tensor:
 def exposure(primal: Tensor) -> Tensor:
     """The typical radiance of images (N, 3, H, W) divided by ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
 
-    The typical radiance is the median of the means of blocks of 16x16 pixels that are not black. It is proportional to
-    the brightness of the image. Neither a few pixels nor the number of samples change it, except for noise. ``primal``
-    must be finite.
+    The image is cut into blocks of 16x16 pixels. The typical radiance is the median of the means of all blocks that are
+    not black. It is proportional to the brightness of the image. It depends neither on a few bright pixels nor, apart
+    from noise, on the number of samples. ``primal`` must be finite.
     """
     size = min(BLOCK, primal.shape[-2]), min(BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)
@@ -158,7 +161,7 @@ def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]
     """The normalised layers, and the exposure (N, 1, 1, 1).
 
     Radiance is divided by the exposure, depth by its maximum, and albedo is clamped to [0, 1]. Exposure and maximum are
-    those of the given layers: normalise whole images, not tiles.
+    those of the given layers, so these must be whole images, not tiles.
     """
     scale = exposure(layers["primal"])
     result = dict(layers)

@@ -1,9 +1,10 @@
-"""Heads: from a network's prediction to the logarithm of the image. They hold no weights.
+"""Heads compute the logarithm of the image from the prediction of a network. They have no trained weights.
 
     Direct     the prediction is the logarithm [Kettunen et al. 2019]
     Residual   the prediction corrects the logarithm of the image that the network starts from
     Mixture    the prediction has a weight for each of several images, and a correction of the logarithm of their mean
-    Pyramid    the prediction has kernels at several resolutions of one image, which are blended from coarse to fine
+    Pyramid    the prediction has kernels, which filter one image at several resolutions; the results are blended from
+               coarse to fine
                [Vogels et al. 2018, "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 
 Each head is written once, for PyTorch and for ONNX graphs (``ngpt.network.operations``).
@@ -30,9 +31,10 @@ class Head(ABC):
     ``reads``    the layers that ``forward`` gets: the images, and the other layers that the head reads
     ``radius``   the number of pixels by which these layers are larger than the prediction, on every side
     ``reach``    the distance, in pixels, up to which images and prediction influence the result of a pixel
-    ``neutral``  whether a prediction of 0 gives a sensible image, so that training begins there
-    ``normalise``  whether the input of the last convolution is divided by its root mean square in each pixel. Softmax
-                 does not limit features and logits, so without this they would grow until nothing is learnt
+    ``neutral``  whether a prediction of 0 gives a sensible image; if so, training begins with this prediction
+    ``normalise``  whether the input of the last convolution is divided by its root mean square in each pixel. A softmax
+                   does not limit its logits: without this division, features and logits would grow until nothing is
+                   learnt
     """
 
     start: tuple[str, ...] = ()
@@ -73,7 +75,7 @@ class OwnHead(Head):
 
     @abstractmethod
     def logarithm(self, math: Any, prediction: Any, images: list[Any]) -> Any:
-        """``forward`` and ``graph``; ``math`` is ``Tensors`` or ``Nodes``."""
+        """Computes ``forward`` if ``math`` is ``Tensors``, and ``graph`` if it is ``Nodes``."""
 
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
         return self.logarithm(Tensors, prediction, images)
@@ -93,7 +95,7 @@ class Direct(OwnHead):
 
 
 class Residual(OwnHead):
-    """A correction of the logarithm of one image."""
+    """The prediction corrects the logarithm of one image."""
 
     outputs = 3  # type: ignore[assignment]
 
@@ -102,7 +104,7 @@ class Residual(OwnHead):
 
 
 class Mixture(OwnHead):
-    """In each pixel, a weight for each image (softmax), and a correction of the logarithm of their mean."""
+    """The prediction has a weight for each image (softmax), and corrects the logarithm of their weighted mean."""
 
     @property
     def outputs(self) -> int:
@@ -115,23 +117,26 @@ class Mixture(OwnHead):
 
 @dataclass(frozen=True)
 class Pyramid(OwnHead):
-    """Kernels of ``size`` x ``size`` pixels at ``scales`` resolutions of one image, each half as fine as the last.
+    """Filters an image by kernels at several resolutions.
 
-    If there are several images, D is their mean, with a weight for each in each pixel (softmax). w in (0, 1) is the
-    trust in each pixel of D; D_s and w_s are both averaged over 2^s x 2^s pixels:
+    There are ``scales`` resolutions, each half as fine as the last. Kernels have ``size`` x ``size`` pixels.
+
+    D is the image. If there are several, D is their mean, with weights from a softmax in each pixel. w in (0, 1) is the
+    trust in each pixel of D. w_s is the mean of w over 2^s x 2^s pixels, and D_s is the mean of D over these pixels,
+    weighted by w. k_s are the kernels; "down" takes means of 2 x 2 pixels, and "up" interpolates:
 
         I_s(p) = sum of k_s(p, q) w_s(q) D_s(q) / sum of k_s(p, q) w_s(q)       q in the kernel around p
         o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
 
-    o_0 is the result. A low trust removes a pixel that a rare bright path has hit from all neighbours, at every
-    resolution [as in Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust
-    is divided by 1 + D, so that such pixels do not dominate the start of training. The predictions of k_s and a_s are
-    averaged over the pixels of the resolution.
+    o_0 is the result. If a rare bright path has hit a pixel, a low trust in this pixel keeps its light out of all
+    neighbours, at every resolution [as in Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a
+    kernel-splatting network"]. The trust is divided by 1 + D, so that bright pixels do not dominate at the start of
+    training. The predictions of k_s and a_s are averaged over the 2^s x 2^s pixels.
 
-    ``demodulate``  the kernels average the image divided by the reflectance, and the result is multiplied by it again,
-                    so texture is not averaged. The weight of a pixel is multiplied by its reflectance, as in a
-                    least-squares fit of the image by the reflectance. Without this, a lamp, whose albedo is 0, would
-                    spread ten times its light
+    ``demodulate``  the kernels average the image divided by the reflectance, and the result is multiplied by the
+                    reflectance again, so texture is not averaged. The weight of a pixel is multiplied by its
+                    reflectance, as in a least-squares fit of the image by the reflectance. Without this factor, a lamp
+                    would spread ten times its light, because its albedo is 0 and its reflectance 0.1
     """
 
     normalise = True
@@ -146,12 +151,13 @@ class Pyramid(OwnHead):
 
     @property
     def reach(self) -> int:
-        # The kernel, the averaged pixels, and the pixels that bilinear interpolation reads, at the coarsest scale.
+        # At each scale: the radius of the kernel, one pixel for averaging, and one for bilinear interpolation.
         return sum((self.size // 2 + 2) << scale for scale in range(self.scales))
 
     @property
     def outputs(self) -> int:
-        # The trust; a kernel for each scale, and a share for each but the coarsest; the weights of several images.
+        # The trust, a kernel for each scale, a share a_s for each scale but the coarsest, and the weights of several
+        # images.
         return self.scales * (self.size**2 + 1) + self._weights
 
     @property

@@ -16,7 +16,7 @@ class Identity:
 
     ``file``     its name, without the folder
     ``sha256``   the hash of its contents, 64 hexadecimal digits
-    ``shipped``  the method that it belongs to, if this package ships the same bytes; "" for any other file
+    ``shipped``  the method whose shipped file has the same bytes; "" if there is none
     """
 
     file: str

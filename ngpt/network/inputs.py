@@ -1,16 +1,18 @@
 """Gathers the inputs of networks from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
 
     primal, dx, dy, albedo, normal, depth      layers of the stack
-    diffuse, specular                          layers of the stack: light by the lobe of its first scattering event
+    diffuse, specular                          layers of the stack: light, split by the lobe of its first
+                                               scattering event
     primal_var, dx_var, dy_var                 variances of the layers, NaN where unknown (for ONNX graphs)
     primal_se, dx_se, dy_se, diffuse_se, specular_se
                                                standard errors: roots of the variances, 0 where unknown (for PyTorch)
     base                                       a classical reconstruction of ``ngpt.classical.bases``
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
-Radiance excludes directly visible emission. OIDN removes less noise from the base than from the primal. So its two
-images have different errors, and a network can combine them [after Back et al. 2020, "Deep Combiner for Independent and
-Correlated Pixel Estimates"; here a denoised image of the correlated estimate takes the place of their kernel].
+All radiance excludes directly visible emission. OIDN removes less noise from the base than from the primal. So OIDN's
+image of the base has other errors than its image of the primal, and a network can combine both images [after Back et
+al. 2020, "Deep Combiner for Independent and Correlated Pixel Estimates"; here a denoised image of the correlated
+estimate takes the place of their kernel].
 """
 
 from collections.abc import Collection
@@ -95,11 +97,13 @@ def base_image(data: Repaired, base: str) -> np.ndarray:
 class Oidn:
     """OIDN's images of one frame. The features are prefiltered once, unless they are clean.
 
-    OIDN denoises the primal with all of its light, as in its training. Networks get this image minus OIDN's image of
-    ``caustic``, which is added to their result again. So caustics in the result are as sharp as in OIDN's image.
+    OIDN denoises the primal with all of its light, as in OIDN's training. Networks get this image minus OIDN's image of
+    the layer ``caustic`` (light that gradients exclude). OIDN's image of ``caustic`` is added to the result of the
+    network again. So caustics in the result are as sharp as in OIDN's image.
 
-    OIDN's largest network denoises the primal: with smaller ones, ngpt-combine has 8 % more error. Its smallest network
-    denoises the base: larger ones change the error of ngpt-combine by less than 1 % in rooms (docs/lab/log).
+    OIDN's largest network denoises the primal: with a smaller network, ngpt-combine has 8 % more error. OIDN's smallest
+    network denoises the base: a larger network changes the error of ngpt-combine by less than 1 % in rooms
+    (docs/lab/log).
     """
 
     def __init__(self, data: Repaired):
@@ -121,7 +125,8 @@ class Oidn:
 
     def of_base(self, base: np.ndarray) -> np.ndarray:
         """OIDN's image of a reconstruction, (H, W, 3) float32; both without direct emission."""
-        # Beside edges, a base may be negative. It is clamped to 0, or to the least value of the primal.
+        # Beside edges, a base may be negative. Negative values are clamped to 0, or to the least value of the primal if
+        # that is negative.
         least = min(float(self._data.image.min()), 0) - self._data.direct
         return oidn(replace(self._with_clean_features, image=np.maximum(base, least), fine={}), "clean", "fast")
 
@@ -140,9 +145,9 @@ class Oidn:
 
 
 def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
-    """The layers of ``DENOISED`` among ``names``, (H, W, 3) without direct emission; without a base, not its image.
+    """The layers of ``DENOISED`` that are in ``names``, (H, W, 3), without direct emission.
 
-    Raises NgptError where OIDN is not installed.
+    "denoised_base" is left out if ``base`` is None. Raises NgptError if OIDN is not installed.
     """
     images = {"denoised": by_oidn.of_primal} if "denoised" in names else {}
     if "denoised_base" in names and base is not None:
@@ -151,10 +156,11 @@ def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> 
 
 
 def _layer(name: str) -> str:
-    """The layer of a stack that an input equals, or is the square root of."""
+    """The layer of a stack that equals an input, or whose square root is the input."""
     return name.replace("_se", "_var")
 
 
 def _standard_error(variance: np.ndarray) -> np.ndarray:
-    # Where the camera sees an emitter, the variance is unknown. The other light of such a pixel hardly matters.
+    # Where the camera sees an emitter, the variance is unknown. It counts as 0 there, because the other light of such a
+    # pixel hardly matters.
     return np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))

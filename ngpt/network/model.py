@@ -11,8 +11,9 @@ from ngpt.network import features, padding
 from ngpt.network.config import ModelConfig
 from ngpt.network.transfer import signed_exp, signed_log
 
-# For ``quiet``: the side, in pixels, of the window over which variances are averaged (those of single pixels are too
-# noisy); a number that is added to radiance before noise is divided by it; a large number with a finite square.
+# For ``quiet``. WINDOW is the side, in pixels, of the window over which variances are averaged, because variances of
+# single pixels are too noisy. DARK is added to radiance before noise is divided by radiance. HUGE is a large number
+# whose square is finite.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 
@@ -21,10 +22,10 @@ class Reconstructor(nn.Module):
 
         exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 
-    H and W are arbitrary. If the input is k times as bright, so is the result. The result is clamped to the range of
-    the primal and 0. The layers are those of ``ModelConfig.layers``, with finite values.
+    H and W are arbitrary. If the input is k times as bright, so is the result. The result is clamped to the least range
+    that holds 0 and all values of the primal. The layers are those of ``ModelConfig.layers``, with finite values.
 
-    A network of OIDN's shape has OIDN's own steps before and after it instead (``ngpt.network.oidnet``).
+    For a network of OIDN's shape, OIDN's own steps take the place of these (``ngpt.network.oidnet``).
     """
 
     def __init__(self, config: ModelConfig):
@@ -39,9 +40,10 @@ class Reconstructor(nn.Module):
 
     @property
     def radius(self) -> int:
-        """The distance in pixels to which an input pixel influences the image, except by exposure, depth and bounds."""
+        """How far, in pixels, an input pixel influences the image, except through exposure, depth scale and bounds."""
         head = self.config.head
-        # Pyramids and sweeps average the predictions of the network; other heads read only pixels of the input.
+        # Pyramids and sweeps average the predictions of neighbouring pixels, so the distances of network and head add
+        # up. Other heads read only neighbouring pixels of the input.
         moves = self.config.scales > 1 or self.config.sweeps
         own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)

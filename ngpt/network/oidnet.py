@@ -23,8 +23,8 @@ SHAPES: dict[tuple[int, ...], tuple[int, ...]] = {
 # The layers that the network reads in addition to the colour.
 FEATURES = ("albedo", "normal")
 
-# Exposure: the geometric mean of the luminances of bins after exposure, the approximate side of a bin in pixels, and
-# the luminance up to which bins are left out.
+# For the exposure, an image is divided into bins. KEY is the geometric mean of the luminances of bins after exposure,
+# and BIN the approximate side of a bin in pixels. Bins with a luminance up to LEAST are left out.
 KEY, BIN, LEAST = 0.18, 16, 1e-8
 LUMINANCE = (0.212671, 0.715160, 0.072169)
 # The curve from radiance y to its code x, in three pieces. The largest number in half precision has the code 1.
@@ -35,7 +35,7 @@ LARGEST = 65504.0
 
 
 def perceptual(y: Tensor) -> Tensor:
-    """Radiance >= 0 to codes, 1 for ``LARGEST``."""
+    """The codes of radiance >= 0; the code of ``LARGEST`` is 1."""
     power = B * y.clamp(min=Y0) ** C + D
     curve = torch.where(y <= Y0, A * y, torch.where(y <= Y1, power, E * torch.log(y + F) + G))
     return curve / _code_of_largest()
@@ -53,7 +53,7 @@ def _code_of_largest() -> float:
 
 
 def exposure(colour: Tensor) -> Tensor:
-    """The factor (N, 1, 1, 1) on radiance (N, 3, H, W); 1 for black images."""
+    """The factor (N, 1, 1, 1) by which radiance (N, 3, H, W) is multiplied; 1 for black images."""
     weights = torch.tensor(LUMINANCE, dtype=torch.float64, device=colour.device).reshape(3, 1, 1)
     means = (colour.clamp(min=0) * weights).sum(1)
     for axis in (1, 2):
@@ -72,10 +72,10 @@ def exposure(colour: Tensor) -> Tensor:
 
 
 class OidnUNet(nn.Module):
-    """(N, 9, H, W) to codes (N, 3, H, W); negative codes count as 0. H and W are divisible by ``alignment``.
+    """Maps inputs (N, 9, H, W) to codes (N, 3, H, W); negative codes count as 0. ``alignment`` divides H and W.
 
-    ``channels`` is a key of ``SHAPES``. The untrained network returns its first three channels, the colour. Its layers
-    have the names that OIDN expects.
+    ``channels`` is a key of ``SHAPES``. The untrained network returns the first three channels of its input, which hold
+    the colour. Its layers have the names that OIDN expects.
     """
 
     alignment = 16
@@ -129,7 +129,7 @@ class OidnUNet(nn.Module):
             return self.dec_conv0(x.float())
 
     def image(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """The denoised colour (N, 3, H, W) of any size, as by OIDN, but clamped to the brightest input colour."""
+        """OIDN's image of the colour (N, 3, H, W), of any size, but clamped to the brightest value of the input."""
         height, width = colour.shape[-2:]
         scale = exposure(colour)
         given = [perceptual(colour.clamp(min=0) * scale), albedo.clamp(0, 1), normal.clamp(-1, 1) / 2 + 0.5]

@@ -1,7 +1,7 @@
 """The operations of heads other than +, -, * and /: on tensors of PyTorch, and as nodes of an ONNX graph.
 
 ``Tensors`` and ``Nodes`` have the same methods, so that a head is written once for both. Images are (N, C, H, W); an
-``axis`` is ``X`` or ``Y``. Lists of images have one weight or logarithm of a weight for each image.
+``axis`` is ``X`` or ``Y``. For a list of images, there is one weight, or the logarithm of a weight, for each image.
 """
 
 from typing import Any
@@ -79,10 +79,10 @@ class Tensors:
 
     @staticmethod
     def filtered(logits: Tensor, image: Tensor, weight: Tensor, size: int) -> Tensor:
-        """Means of an image by kernels of size x size pixels.
+        """Weighted means over size x size pixels of an image.
 
-        A pixel has the weight exp(``logits``) of its tap, (N, size², H, W), times its own ``weight`` (N, 1, H, W).
-        Taps are in row-major order. Pixels beyond the border have no weight.
+        The weight of a pixel is exp(``logits``) at its tap (its place in the window), (N, size², H, W), times the
+        pixel's own ``weight`` (N, 1, H, W). Taps are in row-major order. Pixels beyond the border have no weight.
         """
         height, width = image.shape[-2:]
         border = 4 * (size // 2,)
@@ -99,8 +99,8 @@ def averaged(kernels: Tensor, image: Tensor, size: int) -> Tensor:
     """
     height, width = kernels.shape[-2:]
     total = torch.zeros_like(image[..., :height, :width])
-    # One tap after the other, because all at once would take the memory of size² images. ``unbind``, because the
-    # gradient of each slice would be a tensor of the size of all kernels.
+    # Taps are added one after the other, because all at once would take the memory of size² images. ``unbind`` is used,
+    # because the gradient of each slice would be a tensor of the size of all kernels.
     for tap, kernel in enumerate(kernels.unbind(1)):
         y, x = divmod(tap, size)
         total = total + kernel[:, None] * image[..., y : y + height, x : x + width]
@@ -108,7 +108,10 @@ def averaged(kernels: Tensor, image: Tensor, size: int) -> Tensor:
 
 
 class Nodes:
-    """The operations as nodes of a graph; ``op`` has ONNX's operators by name, ``signed_log`` and ``signed_exp``."""
+    """The operations as nodes of a graph.
+
+    ``op`` has ONNX's operators by name, and ``signed_log`` and ``signed_exp``.
+    """
 
     def __init__(self, op: Any):
         self._op = op
@@ -144,7 +147,7 @@ class Nodes:
         return self._op.Where(self._op.Greater(x, 0.0), then, otherwise)
 
     def mixed(self, logits: Any, images: list[Any]) -> Any:
-        # ONNX Runtime computes its own softmax over the last axis only, between two transpositions of all channels.
+        # ONNX Runtime's own softmax works only over the last axis, so it would transpose all channels before and after.
         weights = self._op.Exp(logits - self._op.ReduceMax(logits, [1], keepdims=1))
         total = 0.0
         for i, image in enumerate(images):
@@ -160,7 +163,7 @@ class Nodes:
         return self.mixed(logits + self._op.Concat(*trust, axis=1), pixels)
 
     def _shifted(self, image: Any, size: int) -> list[Any]:
-        """The pixels (N, C, H, W) that each tap reads, in row-major order, of (N, C, H + size - 1, W + size - 1)."""
-        # The size of the image is unknown here, so slices end relative to its end; the last one ends beyond any size.
+        """For each tap, in row-major order, the pixels (N, C, H, W) that it reads; H and W are without the border."""
+        # The size of the image is unknown here, so slices end relative to its end. The last slice ends beyond any size.
         ends = [n - size + 1 if n < size - 1 else 2**62 for n in range(size)]
         return [self._op.Slice(image, [y, x], [ends[y], ends[x]], [2, 3]) for y in range(size) for x in range(size)]

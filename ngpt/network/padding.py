@@ -13,17 +13,17 @@ Pads = tuple[int, int, int, int]
 
 
 def pads(height: int, width: int, alignment: int, margin: int = MARGIN) -> Pads:
-    """(top, bottom, left, right): ``margin``, and more at the bottom and right up to multiples of ``alignment``."""
+    """The padding (top, bottom, left, right): ``margin``, and at the bottom and right as much as alignment needs."""
     return (margin, margin + -(height + 2 * margin) % alignment, margin, margin + -(width + 2 * margin) % alignment)
 
 
 def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
     """The layers (..., H, W), padded by reflection; the border pixels themselves are not repeated.
 
-    dx and dy, and layers whose names begin with dx or dy, become the differences of the reflected image. So their sign
-    is flipped in the reflection, except for layers without sign, whose names end with _se or _noise. The unused last
-    column of dx (last row of dy) is inside the padded image, and gets the value of its mirror image. An image that is
-    smaller than the padding is reflected back and forth.
+    Layers whose names begin with dx or dy become the differences of the reflected image. So their sign is flipped in
+    the reflection, except for layers without sign, whose names end with _se or _noise. The last column of dx (last row
+    of dy), unused in the given layers, lies inside the padded image. It gets the reflected difference between the last
+    two columns (rows). An image that is smaller than the padding is reflected back and forth.
     """
     height, width = next(iter(layers.values())).shape[-2:]
     device = next(iter(layers.values())).device
@@ -49,7 +49,7 @@ def crop(image: Tensor, pads: Pads) -> Tensor:
 def extended(image: Tensor, radius: int) -> Tensor:
     """A padded image (N, C, H, W) with ``radius`` more pixels on every side, which repeat its border.
 
-    They influence only pixels that ``crop`` removes.
+    The added pixels influence only pixels that ``crop`` removes.
     """
     return replicated(image, 4 * (radius,), "replicate") if radius else image
 

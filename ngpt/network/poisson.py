@@ -1,7 +1,7 @@
 """A head that draws the image of another head toward the gradients, by a screened Poisson equation.
 
-The network predicts weights, which say how far to trust the image and the differences in each pixel. With D the image
-of the other head, and w_d, w_x and w_y the weights, the result approaches the I that minimises
+The network predicts weights, which say how far to trust the image and the differences in each pixel. D is the image of
+the other head, and w_d, w_x and w_y are the weights. The result approaches the image I that minimises
 
     sum of  w_d |I - D|² + w_x |I(x+1, y) - I(x, y) - dx|² + w_y |I(x, y+1) - I(x, y) - dy|²
 
@@ -11,9 +11,9 @@ Rousselle et al. 2016 and Manzi et al. 2016 compute them from variances].
 The unknown is the change u = I - D, whose differences should be the residuals r = dx - ΔD (and the same for dy). The
 equation is solved at ``SCALES`` resolutions, from the coarsest to the finest. At each resolution, ``sweeps`` steps of a
 damped Jacobi iteration start from the change at the coarser one. So a result depends only on nearby pixels, and tiles
-agree with the whole image. Coarser changes are means over 2 x 2 pixels. A residual between two of these is the mean,
-over two rows, of r(2x, y) / 2 + r(2x+1, y) + r(2x+2, y) / 2. Each row is weighted by its inverse variance, as which the
-weights w serve.
+agree with the whole image. Coarser changes are means over 2 x 2 pixels. A residual between two coarser pixels is the
+mean, over their two rows, of r(2x, y) / 2 + r(2x+1, y) + r(2x+2, y) / 2. In this mean, each row is weighted by its
+inverse variance. The weights w serve as inverse variances of single residuals.
 """
 
 from dataclasses import dataclass, field
@@ -24,8 +24,8 @@ from ngpt.network.operations import X, Y
 
 # The number of resolutions: the coarsest pixels are 8 wide.
 SCALES = 4
-# Variances relative to the squared brightness, which the network corrects: the variance of the image, and a variance
-# that is added to the measured variances of differences.
+# Variances relative to the squared brightness. IMAGE_VARIANCE is that of the image D, and LEAST_VARIANCE is added to
+# the measured variances of differences. The network corrects the weights that result from them.
 IMAGE_VARIANCE, LEAST_VARIANCE = 2e-3, 1e-5
 # The network changes the logarithm of a weight by at most RANGE. DAMPING is the length of a step of the iteration.
 RANGE, DAMPING = 10.0, 0.8
@@ -75,9 +75,10 @@ def solved(math: Any, image: Any, logits: Any, gradients: list[Any], sweeps: int
     """``image`` (N, 3, H, W), drawn toward the gradients. H and W are divisible by 2^(SCALES - 1).
 
     ``math``       ``Tensors`` or ``Nodes`` of ``ngpt.network.operations``
-    ``logits``     (N, 3 SCALES, H, W): for each resolution, finest first, corrections of the logarithms of w_d, w_x and
-                   w_y, relative to the weights by variances; they are averaged over the pixels of the resolution
-    ``gradients``  the layers ``GRADIENTS``: dx and dy (N, 3, H, W), and their standard errors over the brightness
+    ``logits``     (N, 3 SCALES, H, W): for each resolution, finest first, numbers that are added to the logarithms of
+                   w_d, w_x and w_y, which are computed from variances. These numbers are averaged over the pixels of
+                   the resolution
+    ``gradients``  the layers ``GRADIENTS``: dx and dy (N, 3, H, W), and their standard errors divided by the brightness
                    (N, 1, H, W), 0 where unknown
     """
     dx, dy, x_noise, y_noise = gradients
@@ -102,7 +103,7 @@ def solved(math: Any, image: Any, logits: Any, gradients: list[Any], sweeps: int
 
 
 def _precision(math: Any, noise: Any) -> Any:
-    """Inverse variances of differences from their standard errors. 0 means unknown: then it is that of the image."""
+    """Inverse variances of differences from standard errors; where these are 0 (unknown), that of the image."""
     return math.where_positive(noise, math.inverse(noise * noise + LEAST_VARIANCE), 1 / IMAGE_VARIANCE)
 
 

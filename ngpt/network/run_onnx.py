@@ -35,7 +35,7 @@ DEVICES = {
 # ONNX Runtime's names of types -> types of NumPy.
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
-# Light that is subtracted from the layers before a network reads them, and layers about it.
+# Light that is subtracted from the layers before a network reads them; its variance, and a denoised image of it.
 _APART = ("direct", "caustic", "caustic_var", "denoised_caustic")
 
 Progress = Callable[[int, int], None]
@@ -72,8 +72,8 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
-        # For other hosts, the graph subtracts this light itself. Here callers have subtracted it, so it gets zeros.
-        # Graphs of earlier versions have fewer such inputs.
+        # In other hosts, the graph subtracts this light itself. Here callers have subtracted it already, so these
+        # inputs get zeros. Graphs of earlier versions have fewer of these inputs.
         self.apart = tuple(name for name in names if name in _APART)
         self.inputs = tuple(name for name in names if name not in _APART)
         optional = metadata.get("ngpt.optional", "direct").split(", ")

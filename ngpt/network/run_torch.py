@@ -75,7 +75,7 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
 
 
 def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:
-    """For each tile: the pixels that it is for, and the pixels that the network reads; divisible by ``alignment``."""
+    """For each tile: the pixels whose result it gives, and the pixels that it reads. ``alignment`` divides all ends."""
     margin = -(-radius // alignment) * alignment
     step = max(tile - 2 * margin, alignment) // alignment * alignment if length > tile else length
     return tiles.spans(length, step, margin)

@@ -96,7 +96,7 @@ def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
 
 
 def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None:
-    """Sets all parameters of a module; ``path`` is for messages. Raises NgptError as ``check_fit``."""
+    """Sets all parameters of a module; ``path`` is for messages. Raises NgptError as ``check_fit`` does."""
     check_fit(module.state_dict(), tensors, path)
     module.load_state_dict(tensors)
 
@@ -122,8 +122,9 @@ def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: st
 def in_halves(tensors: Mapping[str, Tensor], path: str) -> dict[str, Tensor]:
     """The tensors in 16 bits; ``path`` is for messages.
 
-    Raises NgptError for numbers beyond 65504, and if all weights of an output are so small that 16 bits change them by
-    more than rounding. Such weights may matter, because their scale may be a separate parameter. Small biases do not.
+    Raises NgptError for numbers beyond 65504. Also raises it if all weights of an output are so small that 16 bits
+    change them by more than rounding: such weights may matter, because their scale may be a separate parameter. Small
+    biases do not matter, and are accepted.
     """
     halves = {name: tensor.half() for name, tensor in tensors.items()}
     for name, tensor in tensors.items():

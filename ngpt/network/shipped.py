@@ -29,9 +29,10 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class Shipped:
-    """The shipped network of this name; the option ``weights`` puts a file in its place.
+    """The shipped network ``name``. The option ``weights`` puts a file in its place.
 
-    ``also_missing``  returns what it lacks on this machine, apart from ONNX Runtime and its file; "" for nothing
+    ``also_missing``  returns what the network lacks on this machine, apart from ONNX Runtime and its own file; "" if it
+                      lacks nothing
     """
 
     name: str
@@ -42,7 +43,7 @@ class Shipped:
         return WEIGHTS / f"{self.name}.onnx"
 
     def missing(self) -> str:
-        """Why it cannot be used on this machine; "" if it can."""
+        """Why the network cannot be used on this machine; "" if it can."""
         if find_spec("onnxruntime") is None:
             return f"ONNX Runtime is not installed: {package_command('onnxruntime')}"
         if not self.path.is_file():

@@ -42,7 +42,7 @@ class Convolution(nn.Module):
         self.v = nn.Parameter(torch.empty(shape))
         self.s = nn.Parameter(torch.ones(outputs))
         self.bias = nn.Parameter(torch.zeros(outputs))
-        # The output depends only on the direction of v. Its length determines how fast Adam rotates it.
+        # The output depends only on the direction of v. The length of v determines how fast Adam rotates v.
         std = 1.612 / math.sqrt(inputs * size * size)
         nn.init.trunc_normal_(self.v, std=std, a=-2 * std, b=2 * std)
 
@@ -97,8 +97,8 @@ class LastConvolution(nn.Module):
 
     It predicts logarithms: rounding them to 16 bits would change radiance by some per cent.
 
-    ``zero``       whether the weights start at 0, for predictions where 0 is sensible, such as corrections. They are
-                   not normalised then, because a zero vector has no direction
+    ``zero``       whether the weights start at 0, for predictions where 0 is sensible, such as corrections. If so, the
+                   weights are not normalised, because a zero vector has no direction
     ``normalise``  whether the input is divided by its root mean square in each pixel; needs ``zero``
     """
 
@@ -118,8 +118,8 @@ class LastConvolution(nn.Module):
             x = x.float()
             if not self.normalise or isinstance(self.convolution, Convolution):
                 return self.convolution(x)
-            # In ONNX Runtime, a convolution to one channel is the fastest mean over channels. The output is divided
-            # in place of the input, because it has fewer channels.
+            # In ONNX Runtime, a convolution to one channel is the fastest mean over channels. The output is divided in
+            # place of the input, because the output has fewer channels.
             square = conv2d(x * x, x.new_full((1, x.shape[1], 1, 1), 1 / x.shape[1]))
             bias = self.convolution.bias
             assert bias is not None
@@ -149,7 +149,7 @@ def radius(convolutions: list[int], pooling: str) -> int:
 
 
 class DenseUNet(nn.Module):
-    """(N, inputs, H, W) to (N, outputs, H, W), with H and W divisible by ``alignment``.
+    """Maps (N, inputs, H, W) to (N, outputs, H, W), with H and W divisible by ``alignment``.
 
     ``growth``   for each level, the number of channels that each unit adds
     ``units``    for each level, the number of units on the way down, and again on the way up
@@ -210,7 +210,8 @@ class DenseUNet(nn.Module):
 class PlainUNet(nn.Module):
     """A U-Net with two 3x3 convolutions for each level and direction, and one skip connection for each level.
 
-    (N, inputs, H, W) to (N, outputs, H, W). ``widths`` are the channels of the levels; all else is as in ``DenseUNet``.
+    It maps (N, inputs, H, W) to (N, outputs, H, W). ``widths`` are the channels of the levels; all else is as in
+    ``DenseUNet``.
     """
 
     def __init__(
