@@ -47,7 +47,7 @@ def pytest_runtest_makereport():
 
 
 class Written:
-    """Sums up the reports, and writes them in the end. Files that did not run keep what they have."""
+    """Sums up the reports of a run, and writes the sums when it ends."""
 
     def __init__(self, path: Path):
         self.path, self.cases = path, Counter()
@@ -56,15 +56,13 @@ class Written:
         self.cases[report.nodeid] += getattr(report, "processor", 0)
 
     def pytest_sessionfinish(self):
-        found = json.loads(self.path.read_text("utf-8")) if self.path.exists() else {"files": {}, "cases": {}}
         files = Counter()
         for case, seconds in self.cases.items():
             files[case.split("::")[0]] += seconds
-        kept = {case: seconds for case, seconds in found["cases"].items() if case.split("::")[0] not in files}
-        cases = kept | {case: round(seconds, 1) for case, seconds in self.cases.items() if seconds >= LEAST}
-        files = found["files"] | {file: round(seconds, 1) for file, seconds in files.items()}
-        self.path.write_text(json.dumps({"files": _dearest(files), "cases": _dearest(cases)}, indent=1) + "\n", "utf-8")
+        cases = {case: seconds for case, seconds in self.cases.items() if seconds >= LEAST}
+        found = {"files": _dearest(files), "cases": _dearest(cases)}
+        self.path.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
 
 
-def _dearest(seconds: dict) -> dict:
-    return dict(sorted(seconds.items(), key=lambda item: (-item[1], item[0])))
+def _dearest(seconds: dict[str, float]) -> dict[str, float]:
+    return {name: round(s, 1) for name, s in sorted(seconds.items(), key=lambda item: (-item[1], item[0]))}

@@ -7,9 +7,7 @@ import mitsuba as mi
 import numpy as np
 from references import REFERENCES
 from rendered_once import rendered_once
-from unbiased import load
-
-from data_gen.render import render_stack
+from unbiased import load, stacks_of
 
 SIZE = (32, 24)
 BLOCK = 4
@@ -17,8 +15,7 @@ BLOCK = 4
 
 def images(scene, tails, spp, seeds):
     """Independent images, (seeds, H, W, 3) float64."""
-    options = {"tails": tails, "with_features": False}
-    stacks = [render_stack(scene, spp, seed, "primal", unbiased=True, **options) for seed in seeds]
+    stacks = stacks_of(scene, "primal", len(seeds), spp, seeds[0], tails=tails, with_features=False)
     assert all(("tails=shared" in s.attributes["ngpt:samplerOptions"]) == (tails == "shared") for s in stacks)
     return np.stack([s["primal"] for s in stacks]).astype(np.float64)
 

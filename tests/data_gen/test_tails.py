@@ -14,7 +14,7 @@ from media_scenes import nested
 from rendered_once import rendered_once
 from shared_tails import blocks, whole_paths
 from tails_scenes import bulb, mirrors, slit
-from unbiased import light_of_gradients, load
+from unbiased import light_of_gradients, load, stacks_of
 
 import data_gen
 import ngpt
@@ -283,7 +283,7 @@ def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
 def layers_of(scene, tails, spp):
     """Layers of eight images by ``gpt``."""
     scene = load(mi, scene, (32, 24))
-    return [render_stack(scene, spp, seed, "gpt", tails=tails).layers for seed in range(8)]
+    return [stack.layers for stack in stacks_of(scene, "gpt", 8, spp, tails=tails)]
 
 
 @pytest.fixture(scope="module")
@@ -410,7 +410,7 @@ def test_light_below_zero_is_light(renderer):
 def rare(renderer):
     """Layers of 32 images of a room lit through a gap: each (32, 24, 32, 3)."""
     scene = load(renderer, slit, (32, 24))
-    stacks = [render_stack(scene, 32, seed, "primal", tails="shared") for seed in range(32)]
+    stacks = stacks_of(scene, "primal", 32, 32, tails="shared")
     return {name: np.array([s[name] for s in stacks], np.float64) for name in ("primal", "shared", "primal_var")}
 
 
@@ -465,6 +465,6 @@ def test_fewer_rays_find_more(renderer, scene, most):
     """Variance of the image at equal samples, in a room without mirrors and in fog. Measured in fog: .5."""
     scene, noise = load(renderer, scene, (48, 32)), {}
     for tails in ("paths", "shared"):
-        images = np.array([render_stack(scene, 16, seed, "primal", tails=tails)["primal"] for seed in range(4)])
+        images = np.array([stack["primal"] for stack in stacks_of(scene, "primal", 4, 16, tails=tails)])
         noise[tails] = np.median(images.var(axis=0, ddof=1).mean(axis=-1))
     assert noise["shared"] < most * noise["paths"]
