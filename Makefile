@@ -9,7 +9,8 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
 
-WORKERS = -n auto --maxprocesses 4 --dist worksteal
+# A file runs in one process, so that what its tests share is built once.
+WORKERS = -n auto --maxprocesses 4 --dist loadfile
 
 # One minute on two cores: all that neither renders, trains, exports, evaluates, compiles nor starts programs. See conftest.py.
 quick: setup-quick
