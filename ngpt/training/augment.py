@@ -1,4 +1,4 @@
-"""Random changes to training examples, as in NGPT: each of them keeps gradients consistent with the image.
+"""Random changes to training examples, as in NGPT. Each change keeps gradients consistent with the image.
 
 An example is a dict of layers (C, H, W), among them "target", with radiance divided by the exposure. Transforms take
 and return such dicts. [Kettunen et al. 2019, section 5.2 and their code]
@@ -69,8 +69,9 @@ def quieter(
 ) -> GradientStack:
     """The stack with its noise multiplied by ``factor``, as if it had 1 / factor² times the samples.
 
-    It is a weighted mean of the stack and the ``reference`` (H, W, 3). This includes directly visible emission and the
-    light of the layer ``caustic``; ``direct`` and ``caustic`` hold these two parts separately. Features do not change.
+    The result is a weighted mean of the stack and the ``reference`` (H, W, 3). The reference includes directly visible
+    emission and the light of the layer ``caustic``; ``direct`` and ``caustic`` hold these two parts of it. Features do
+    not change.
     """
     light = reference - direct - caustic
     truth = {
@@ -86,12 +87,12 @@ def quieter(
 
 
 def flip_x(layers: Mapping[str, Tensor]) -> Layers:
-    """Mirrored left to right: I'[x] = I[W-1-x], so dx'[x] = -dx[W-2-x] with its unused column last again."""
+    """Mirrors left to right: I'[x] = I[W-1-x], so dx'[x] = -dx[W-2-x]. The unused column of dx stays the last one."""
     return _flip(layers, -1, "dx", 0)
 
 
 def flip_y(layers: Mapping[str, Tensor]) -> Layers:
-    """Mirrored top to bottom."""
+    """Mirrors top to bottom."""
     return _flip(layers, -2, "dy", 1)
 
 
@@ -108,7 +109,7 @@ def _flip(layers: Mapping[str, Tensor], axis: int, difference: str, normal: int)
 
 
 def transpose(layers: Mapping[str, Tensor]) -> Layers:
-    """Mirrored at the diagonal: rows become columns, and dx becomes dy.
+    """Mirrors at the diagonal: rows become columns, and dx becomes dy.
 
     Image y points down and camera y up, so normals (x, y) become (-y, -x).
     """

@@ -1,4 +1,4 @@
-"""Makes training examples from shots, for the network that blends frames (``ngpt.sequence.network``).
+"""Makes training examples from shots (frame sequences), for the network that blends frames (``ngpt.sequence.network``).
 
 The loss is in ``ngpt.training.temporal``.
 """
@@ -26,16 +26,16 @@ from ngpt.training.dataset import Dataset
 
 # Squared relative errors are limited to this value, so that single pixels do not dominate the training.
 OUTLIER = 1.0
-# Errors are divided by a pixel's squared reference plus this share of the mean of squares.
+# Squared errors are divided by the squared reference of the pixel, plus this share of the mean squared reference.
 DARK = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """A shot with one of its inputs, reconstructed by one method: for each frame a stack, a result and a reference.
+    """A shot with one of its inputs, reconstructed by one method: a stack, a result and a reference for each frame.
 
-    Images are (H, W, 3). References exclude direct emission. So do ``halves``: for each frame two references, each from
-    half of the samples.
+    Images are (H, W, 3). ``halves`` has two references for each frame, each from half of the samples. References and
+    halves exclude direct emission.
     """
 
     paired: ClassVar[bool] = False
@@ -48,7 +48,7 @@ class Clip:
 
 
 def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> Iterator[Clip]:
-    """A clip for each shot of the training sets, each of its inputs, and each method.
+    """Yields a clip for each combination of a shot of the training sets, one of its inputs, and a method.
 
     Results are cached in the folder ``kept``. Raises NgptError if a folder is no training set, or has no shots.
     """
@@ -73,7 +73,8 @@ def clips(folders: Sequence[str | Path], methods: Sequence[str], kept: Path) -> 
 
 def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.ndarray:
     """The results of a method frame by frame, from the cache in ``folder``; computed and stored if missing."""
-    # The name is a digest of the stacks: shots are renumbered as a set grows, and several sets may share names.
+    # The file is named by a digest of the stacks, because shots are renumbered as a set grows, and several sets may
+    # share names.
     digest = hashlib.sha256(b"".join(stack["primal"].tobytes() for stack in stacks)).hexdigest()
     kept = make_folder(folder) / f"{digest[:24]}-{method}.safetensors"
     with suppress(OSError, SafetensorError, KeyError):
@@ -84,7 +85,10 @@ def _results(stacks: Sequence[GradientStack], method: str, folder: Path) -> np.n
 
 
 def errors(clip: Clip, images: Sequence[np.ndarray]) -> tuple[float, float]:
-    """(error, flicker): means relative to the reference, without its noise. ``images`` include direct emission."""
+    """(error, flicker) of a clip, relative to the reference and without the noise of the reference.
+
+    Both are means over pixels and frames. ``images`` include direct emission.
+    """
     found, changes = [], []
     last = None
     for stack, image, pair, reference in zip(clip.stacks, images, clip.halves, clip.references, strict=True):
@@ -112,9 +116,11 @@ def weight_of(reference: np.ndarray) -> np.ndarray:
 
 
 def play(clip: Clip, corrections: Corrections, long: float = 1.0) -> Iterator[dict[str, np.ndarray]]:
-    """Yields the training examples of a clip, one for each frame with a history: arrays (C, H, W) by name.
+    """Yields the training examples of a clip: arrays (C, H, W) by name.
 
-    The error of the first result is multiplied by ``long``, as if 1 / long² frames had been blended before.
+    There is one example for each frame that has a history (earlier frames to blend with).
+
+    The error of the first result is multiplied by ``long``, as if it were already a blend of 1 / long² frames.
     """
     temporal = Temporal(corrections)
     last = None

@@ -86,7 +86,8 @@ class StackCrop:
 
     def stack(self, k: int) -> GradientStack:
         stack = read(str(self._stacks[k]))
-        # No network reads this layer, so augmentation does not transform it. Shards leave it out, too.
+        # No network reads the layer ``shared``, so augmentation does not transform this layer. Shards leave it out,
+        # too.
         stack.layers.pop("shared", None)
         return stack
 
@@ -96,7 +97,8 @@ class StackCrop:
 
     @property
     def reference_direct(self) -> np.ndarray:
-        # References by a path tracer lack this layer. Directly visible emission has little noise in any stack.
+        # References from a path tracer lack the layer ``direct``. It is then taken from the stack with the most
+        # samples, because it has little noise in any stack.
         most = self._stacks[int(np.argmax(self.spp))]
         for path in (self._reference, most):
             stack = read(str(path))
@@ -106,9 +108,10 @@ class StackCrop:
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """The layer ``caustic`` of the reference; without it, the denoised mean over all stacks; or else zeros.
+        """The light in the reference that the layer ``caustic`` of the stacks estimates.
 
-        Raises NgptError if only some of the stacks have this layer.
+        If the reference lacks this layer, the result is its mean over all stacks, denoised; or zeros, if it is empty in
+        all stacks. Raises NgptError if only some of the stacks have the layer, with light in it.
         """
         reference = read(str(self._reference))
         if all(self._caustic) and "caustic" in reference:

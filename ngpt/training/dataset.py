@@ -53,15 +53,15 @@ class ShardCrop:
 
     @property
     def paired(self) -> bool:
-        """Whether it has no reference, but two independent inputs with equal samples, each the other's target."""
+        """Whether the crop has no reference, but two independent inputs of equal spp, each the target of the other."""
         return shards.REFERENCES[0] not in self.shard.names
 
     def stack(self, k: int) -> GradientStack:
         """Input ``k`` with all layers of its rendered stack, with finite values.
 
-        It has gradients if its sampler makes them. If the set has subpixels, so has the stack, and its pixels are their
-        means, to the bit. Frames of shots have the layer ``motion``, which is NaN where it is unknown, and everywhere
-        in a first frame.
+        The stack has gradients if its sampler makes them. If the set has subpixels, the stack has them, too, and its
+        pixels are the means of the subpixels, to the bit. Frames of shots have the layer ``motion``. It is NaN where
+        the motion is unknown, and everywhere in a first frame.
         """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: there is no input {k}; the crop has inputs 0 .. {self.inputs - 1}")
@@ -83,7 +83,7 @@ class ShardCrop:
         return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}", fine=fine)
 
     def _pixels(self, k: int) -> dict[str, np.ndarray]:
-        """The layers of input ``k`` by the tensors of pixels, with standard errors in place of variances."""
+        """The layers of input ``k`` from the tensors of pixels, not subpixels; with standard errors, not variances."""
         names = [name for name in self.shard.names if name in shards.OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
@@ -137,8 +137,8 @@ class ShardCrop:
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
-    Only the manifest is read at once. A shard is checked when one of its crops is first read, in each process anew.
-    Raises NgptError for shards that are missing, differ from the manifest, or hold other tensors.
+    Opening a set reads only its manifest. Each process checks a shard when it first reads one of the shard's crops, and
+    raises NgptError if the shard is missing, differs from the manifest, or holds other tensors than it should.
     """
 
     def __init__(self, folder: str | Path):

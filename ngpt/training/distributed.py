@@ -39,7 +39,7 @@ class Processes:
             gradient.copy_(part.view_as(gradient))
 
     def any(self, flag: bool) -> bool:
-        """Whether ``flag`` is true in any process. So all processes stop at the same step."""
+        """Whether ``flag`` is true in any process. All processes get the same answer, so they stop at the same step."""
         if self.count == 1:
             return flag
         value = torch.tensor(float(flag), device=self.device)

@@ -28,14 +28,14 @@ JITTER = 7
 class Examples(TorchDataset):
     """Endless training examples. An example depends only on its index and the seed, not on process and order.
 
-    An example is a random crop with one of its inputs (or the one of ``Augmentation.quieter``), normalised, augmented
-    and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The target covers
-    the middle, which the varying padding never reaches [NGPT's code]. Crops larger than ``size`` are cut at random.
-    Prepared layers are cached in memory, up to ``cache`` bytes.
+    An example is a random crop with one of its inputs (or the input that ``Augmentation.quieter`` adds), normalised,
+    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14). The
+    target covers the middle, which the varying padding never reaches [NGPT's code]. Crops larger than ``size`` are cut
+    at random. Prepared layers are cached in memory, up to ``cache`` bytes.
 
-    If the crop is a pair, the input is one half, and the target is the other half (``ngpt.training.halves``), in layers
-    whose names begin with "other/". If there are both pairs and crops with references, ``pairs`` is the share of the
-    pairs among the examples.
+    A crop may be a pair: two halves of the samples, and no reference (``ngpt.training.halves``). The input is then one
+    half, and the target is the other half, in layers whose names begin with "other/". If there are both pairs and crops
+    with references, ``pairs`` is the share of the examples that are pairs.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Examples(TorchDataset):
                 return which, crop
 
     def _layers(self, which: int, crop: Crop, k: int) -> tuple[Layers, Layers]:
-        """The layers of input ``k`` of a crop, and of its target: "target", or those of the other half."""
+        """The layers of input ``k`` of a crop, and those of its target: only "target", or layers of the other half."""
         if (crop, k) in self._cache:
             self._cache.move_to_end((crop, k))
             return self._cache[crop, k]
@@ -104,7 +104,7 @@ class Examples(TorchDataset):
         return layers, judge
 
     def _quieter(self, which: int, crop: Crop) -> GradientStack:
-        """The input of the crop with the most samples, as if it had more (``augment.quieter``)."""
+        """The input of the crop with the most samples, as if it had even more (``augment.quieter``)."""
         low, high = np.log(self.augmentation.quieter)
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
@@ -123,7 +123,7 @@ class Examples(TorchDataset):
 
 
 def collated(examples: Sequence[Layers]) -> Layers:
-    """A batch of examples. Those with a "target" come first, so that inputs and targets have the same order."""
+    """A batch of examples. Examples with a "target" come first, so that inputs and targets have the same order."""
     ordered = sorted(examples, key=lambda example: "target" not in example)
     names = dict.fromkeys(name for example in ordered for name in example)
     return {name: torch.stack([example[name] for example in ordered if name in example]) for name in names}
@@ -179,7 +179,8 @@ def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
     halves = crop.reference_halves
     if not halves:
         return (target_of(crop, config),)
-    # Halves have no ``caustic`` of their own. Networks without gradients use that of the whole reference.
+    # Results of networks without gradients include the light of ``caustic``. Halves have no such layer of their own, so
+    # they get the one of the whole reference.
     beside = np.zeros_like(halves[0]) if config.reads_gradients else crop.reference_caustic
     return tuple(half + beside for half in halves)
 
@@ -191,7 +192,7 @@ def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
 
 
 def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
-    """Both, with light divided by the exposure of ``layers``."""
+    """The normalised ``layers``, and ``judge`` with its light divided by the exposure of ``layers``."""
     scaled, exposure = features.normalised({name: layer[None] for name, layer in layers.items()})
     light = features.RADIANCE | {"target"}
     return {name: layer[0] for name, layer in scaled.items()}, {

@@ -30,8 +30,9 @@ class Images(Task):
     """Trains on ``crops``, and validates on ``held_out``.
 
     ``loss`` takes scene-linear prediction and target (N, 3, H, W), and a generator of the step's random numbers. If a
-    batch has pairs, it also takes the layers of their other halves; then the target covers only the other examples, and
-    is None without any. If crops are rendered during training, as in a stream, runs cannot be repeated exactly.
+    batch has pairs (examples without a reference), ``loss`` also takes the layers of their other halves. The target
+    then covers only the examples with a reference, and is None if there are none. If crops are rendered during
+    training, as in a stream, runs cannot be repeated exactly.
     """
 
     def __init__(self, settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], loss: Loss):

@@ -19,7 +19,7 @@ from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 from ngpt.training.halves import halves
 
-# A term: (prediction, target), scene-linear (N, 3, H, W) float32 divided by the exposure, -> their mean, a scalar.
+# A term maps (prediction, target), scene-linear (N, 3, H, W) float32 divided by the exposure, to a mean, a scalar.
 Term = Callable[[Tensor, Tensor], Tensor]
 _OURS: dict[str, Term] = {
     "l1": pixelwise.l1,
@@ -66,8 +66,9 @@ TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
 class Loss:
     """A function of prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
 
-    It returns the loss, which is a mean over the predictions, and its parts, by name, before weighting. ``other`` holds
-    the layers of other halves for the last predictions, which have no target (``ngpt.training.halves``).
+    It returns the loss, which is a mean over the predictions, and its parts, by name, before weighting. The last
+    predictions may be of pairs, which have no target: ``other`` holds the layers of their other halves
+    (``ngpt.training.halves``).
     """
 
     def __init__(self, settings: LossSettings, others: dict[str, float] | None = None):

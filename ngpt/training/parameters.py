@@ -48,7 +48,7 @@ def parameter_tables() -> str:
 
 
 def tables_of(text: str) -> dict[str, type | None]:
-    """The tables that a configuration may have; None for those that it may not have, with its kind of network."""
+    """The tables of a configuration; None in place of the dataclass for tables that its kind of network excludes."""
     other = ("temporal",) if "model" in tomllib.loads(text) else ("model", "loss", "augmentation")
     return TABLES | dict.fromkeys(other)
 

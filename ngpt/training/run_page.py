@@ -1,7 +1,7 @@
 """Makes the page of a training run, and the page that compares several runs, without PyTorch.
 
 A page is made from ``log.jsonl`` in the folder of a run, and from ``settings.json``, ``run.json`` and the last
-``validation-STEP`` if they exist. So it can be made of any run at any time.
+``validation-STEP`` if they exist. So a page can be made of any run at any time.
 """
 
 import base64

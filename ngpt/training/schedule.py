@@ -9,7 +9,7 @@ from ngpt.training.settings import OptimizerSettings
 
 
 def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
-    """The learning rate of a ``step`` from 0 to ``steps`` - 1, by ``settings.schedule``:
+    """The learning rate of a ``step`` from 0 to ``steps`` - 1. ``settings.schedule`` says how it changes:
 
     paper    grows exponentially from 1e-4 of the rate to the full rate at ``warmup``, is constant until ``flat``, then
              halves every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]

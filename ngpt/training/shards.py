@@ -7,10 +7,10 @@ A shard has N crops with K inputs each. Tensors are scene-linear, and (N, K, H, 
     albedo, normal, depth
     primal_se                   standard errors, because variances of small numbers would underflow in half floats
     dx, dy, dx_se, dy_se        all or none: inputs of a sampler without gradients have none
-    caustic, caustic_se         light that dx and dy exclude; all three or none
+    caustic, caustic_se         light that dx and dy exclude; all or none, with reference_caustic
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
-    reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
+    reference_halves            (N, 2, H, W, 3), optional: reference_indirect from each half of its samples
     samples                     optional: the number of samples of each pixel, if it varies within inputs
     diffuse, diffuse_se, specular, specular_se    all or none: parts of indirect, where the sampler splits it
     fine_primal, fine_albedo, fine_normal    (N, K, k H, k W, 3), all or none: k x k subpixels of each pixel, with all
@@ -21,14 +21,15 @@ A shard has N crops with K inputs each. Tensors are scene-linear, and (N, K, H, 
 
 The layer ``shared`` of inputs is left out, because no network reads it.
 
-Pairs have K = 2 independent inputs, and no references.
+A crop may be a pair: it has K = 2 independent inputs, and no references.
 
-The frames of a shot are crops in their order; the records of these crops have the numbers of the frames.
+The frames of a shot (a frame sequence) are successive crops. The record of each of these crops has the number of its
+frame.
 
 A tensor is stored in half floats if this changes at most the share ``MAX_LOSS`` of every crop, otherwise in floats.
-With subpixels, ``fine_primal``, ``direct`` and ``caustic`` are always stored in floats. Pixels are the means of their
-subpixels, so otherwise weak light beside a lamp would be lost in their difference to ``direct``. The record of the
-shard is in the metadata of the header, as JSON under "ngpt".
+With subpixels, ``fine_primal``, ``direct`` and ``caustic`` are always stored in floats. The reason is that a pixel is
+the mean of its subpixels: in half floats, weak light beside a lamp would be lost in the difference of this mean to
+``direct``. The record of the shard is in the metadata of the header, as JSON under "ngpt".
 """
 
 import json
@@ -157,8 +158,8 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
     """Writes a shard with the record of its rendering. It has no crops if all of them have failed.
 
-    An existing file is kept: another worker has made it, and its checksum may already be in the manifest. It differs
-    only in the times of its record.
+    An existing file is kept: another worker has made it, and its checksum may already be in the manifest. The two files
+    differ only in the times of their records.
 
     Raises NgptError for values that are not finite, and if the file cannot be written.
     """

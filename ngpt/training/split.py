@@ -19,14 +19,14 @@ class Split(NamedTuple):
 
 
 def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float = 0.0) -> Split:
-    """Sets the scenes aside for validation whose names begin with one of ``validation``.
+    """Sets aside, for validation, the scenes whose names begin with one of ``validation``.
 
     If ``validation`` is empty, a ``share`` of the scenes is set aside, at least one. They are chosen by hashes of their
     names, so that the same set is always split in the same way. With a single scene, a share of its crops is set aside;
     a single crop goes to training.
 
-    Pairs of scenes that are set aside are in neither part, because they have no reference. Raises NgptError for a name
-    in ``validation`` that no scene begins with.
+    No error can be measured on pairs (crops without a reference), so pairs of scenes that are set aside are in neither
+    part. Raises NgptError for a name in ``validation`` that no scene begins with.
     """
     scenes = sorted({crop.scene for crop in crops})
     if not scenes:

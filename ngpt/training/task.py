@@ -51,7 +51,7 @@ class Task(ABC):
         """
 
     def state(self) -> dict[str, Tensor]:
-        """The tensors that the next batches depend on, in addition to the settings and the step, for the checkpoint."""
+        """The tensors, for the checkpoint, on which the next batches depend in addition to settings and step."""
         return {}
 
     def restore(self, state: dict[str, Tensor], path: str) -> None:

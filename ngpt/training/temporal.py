@@ -1,18 +1,19 @@
-"""The task that trains the network that blends frames (``ngpt.sequence.network``), on shots.
+"""The task that trains the network that blends frames (``ngpt.sequence.network``), on shots (frame sequences).
 
-The network makes the histories of frames itself. At the beginning of each round, the current network blends the shots;
-it learns from the resulting histories until the next round [Ross et al. 2011, "A reduction of imitation learning and
-structured prediction to no-regret online learning"]. The results to blend come from several methods, so that the
-network works with any method. The loss of a frame is
+The history of a frame is the blend of the frames before it. The network makes these histories itself. A round is a
+number of training steps. At its beginning, the current network blends the shots. Until its end, the network learns from
+the resulting histories [Ross et al. 2011, "A reduction of imitation learning and structured prediction to no-regret
+online learning"]. The results to blend come from several reconstruction methods, so that the network works with any
+method. The loss of a frame is
 
     E |y - r|² / E_x + FLICKER E |(y - r) - W (y' - r')|² / F_x
 
 where x is the frame before blending, y the blended frame and r the reference. W looks up values along the motion, and a
-prime marks the previous frame. E is a mean of errors relative to r. E_x and F_x are the same errors of x, so all shots
-have equal weight. A further term is the squared difference between the mean brightness of y and of x, over a batch:
-without it, the easiest way to remove specks would be to remove their light. The effect of y on later frames is
-neglected: among filters that know their own variance, the one with the least error now is also the best for later
-frames.
+prime marks the previous frame. E is a mean of errors relative to r. E_x and F_x are the same two means with x in place
+of y; dividing by them gives all frames similar weight. A further term is the squared mean, over a batch, of the
+relative difference in brightness between y and x. Without this term, the easiest way to remove specks would be to
+remove their light. The effect of y on later frames is neglected: among filters that know their own variance, the one
+with the least error now is also the best for later frames.
 """
 
 import copy
@@ -39,7 +40,8 @@ from ngpt.training.validation import Pictures, spread
 FLICKER = 1.0
 ENERGY = 300.0
 LEAST = 3e-4
-# Numbers of frames of simulated histories before the first frame of a shot, because shots for training are short.
+# The simulated number of frames that were blended before the first frame of a shot; one of these is drawn for each
+# clip. Without simulated histories, histories would be short, because shots for training are short.
 LENGTHS = (1, 1, 4, 12)
 # The share of clips to which a change of light is added, because light changes little in the shots.
 RELIT = 0.4
@@ -49,7 +51,7 @@ class Blending(Task):
     """Trains on the frames of ``clips``, and validates on ``held_out``.
 
     All random numbers depend only on the seed and the number of the round or step. A batch also depends on the weights
-    that made the histories of its round. They are the ``state`` of the task.
+    that made the histories of its round. These weights are the ``state`` of the task.
     """
 
     def __init__(self, settings: Settings, clips: Sequence[Clip], held_out: Sequence[Clip]):
@@ -68,7 +70,8 @@ class Blending(Task):
         self.settings, self.clips, self.table = settings, clips, settings.temporal
         self.held_out = spread(held_out, settings.run.views)
         self._player: dict[str, Tensor] = {}
-        # Scores of ``held_out`` without blending and by the rules without a network, which never change: (2, clips, 2).
+        # Scores of ``held_out``, (2, clips, 2): without blending, and blended by rules without a network. They never
+        # change.
         self._fixed: np.ndarray | None = None
 
     def network(self) -> nn.Module:
@@ -125,7 +128,8 @@ class Blending(Task):
     def validate(self, model: nn.Module, picture: Path) -> dict[str, float]:
         """Errors and flicker relative to the reference, without its noise: geometric means over the clips.
 
-        "primal" stands for results without blending, "base" for the blend by the rules without a network.
+        "primal" stands for results without blending, and "base" for results that are blended by rules without a
+        network.
         """
         if not self.held_out:
             return {}
@@ -164,7 +168,7 @@ class Blending(Task):
 
 
 def loss(corrections: Tensor, batch: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-    """The loss of frames (N, C, H, W) from ``play``, and its parts. Without any improvement it is 1 + FLICKER."""
+    """The loss of frames (N, C, H, W) from ``play``, and its parts; about 1 + FLICKER if blending improves nothing."""
     shares = MOST * torch.sigmoid(batch["prior"] + LARGEST * torch.tanh(corrections / LARGEST))
     shares = batch["trust"] * torch.minimum(shares, batch["first"])
     bands = batch["bands"].unflatten(1, (BANDS, 3))

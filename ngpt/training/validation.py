@@ -57,7 +57,7 @@ class Pictures:
 
 
 def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
-    """At most ``count`` pairs of a crop and the number of an input, evenly spread over all."""
+    """At most ``count`` views, (crop, number of an input), evenly spread over all views."""
     return spread([(crop, k) for crop in crops for k in range(crop.inputs)], count)
 
 
@@ -74,9 +74,9 @@ def validate(
 ) -> dict[str, float]:
     """Geometric means, over views (crop, input), of the trimmed relMSE without direct emission.
 
-    With two halves of a reference, errors do not include its noise. "relMSE" is the error of the result, "relMSE
-    primal" of the input, and "relMSE base" of the base (NaN without one). If ``picture`` is given, a picture of some
-    views is written to that file (``Pictures``).
+    If a reference has two halves, errors do not include the noise of the reference. "relMSE" is the error of the
+    result, "relMSE primal" of the input, and "relMSE base" of the base (NaN without one). If ``picture`` is given, a
+    picture of some views is written to that file (``Pictures``).
     """
     model.eval()
     device = next(model.parameters()).device
