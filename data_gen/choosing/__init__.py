@@ -1,1 +1,1 @@
-"""The choice of sampler, method and number of samples: trials of a scene, and plans made from them."""
+"""Chooses sampler, reconstruction method and number of samples: trials of a scene, and plans based on them."""

@@ -1,11 +1,14 @@
-"""Pipelines from scene to image: a sampler and a method, and the error that they are expected to leave.
+"""Pipelines from scene to image: a sampler and a reconstruction method, and the error that they are expected to leave.
 
-Every method that can use a sampler's four small stacks (``data_gen.choosing.trials``) reconstructs each of them, and
-each half merged. The error at the number of samples that fit into the time is extrapolated by a power law. Its exponent
-comes partly from the pilot, which compares one stack to two, and partly from what is usual for this kind of method.
+In the *pilot* (``data_gen.choosing.trials``), each sampler renders four small stacks (a stack holds the layers of one
+image). Every method that can use these stacks reconstructs each stack, and also the first two merged and the last two
+merged. The error at the number of samples that fit into the time is extrapolated by a power law. Its exponent comes
+partly from the pilot, which compares the errors from one stack and from two, and partly from what is usual for this
+kind of method.
 
-A biased sampler (photons) never judges others. If it finds most of the light, the samplers that judge it are noisy. So
-twice the standard error is added to its measured error. Light that no sampler has found in the pilot is not handled.
+Images of a biased sampler (photons) are not used to measure the errors of other samplers. If the biased sampler finds
+most of the light, the images that measure its error are noisy. So twice the standard error is added to its measured
+error. Light that no sampler has found in the pilot is not handled.
 """
 
 from __future__ import annotations
@@ -22,19 +25,21 @@ from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct, runnable
 from ngpt.stack import GradientStack
 
-# The methods that are best for each kind of stack at some number of samples. All others have more error or are far
-# slower. The most frequent winners come first: if time is short, the others are not measured.
+# The methods that are best at some number of samples, for stacks with and without gradients. All other methods have
+# more error or are far slower. The most frequent winners come first, because later ones are not measured if time is
+# short.
 WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
 WITHOUT = ("oidn", "ngpt-primal", "primal")
 # These numbers come from bench/pipelines.py of commit e61ee6f3, on scenes that are not ``--apart``.
-# The usual exponents of the error as a power of the samples, for methods that use gradients and for denoisers; the
-# weight of the pilot in an exponent, and the steepest and flattest exponents allowed
+# The error is a power of the number of samples. These are its usual exponents for methods that use gradients and for
+# denoisers, the weight of the pilot's measurement in an exponent, and the steepest and flattest exponents allowed.
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
 # The exponent for images by photons, from theory, and the number of standard errors that are added to their error
 _BY_PHOTONS, _DOUBT = -2 / 3, 2.0
-# Adaptive samples with gradients gain this power of what the pilot foretells, since the need that a pilot measures is
-# smoother than the true one. Below FROM samples per pixel, adaptive samples are not considered.
+# If the pilot predicts that adaptive samples leave F times the error of even samples, F to the power REALISED is
+# expected for samplers with gradients: the need for samples that a pilot measures varies less over the image than the
+# true need. Below FROM samples per pixel, adaptive samples are not considered.
 REALISED, FROM = 2.0, 2 * LEAST
 
 
@@ -46,10 +51,10 @@ class Pipeline:
     error: float  # trimmed relMSE
     step: float  # the exponent of the error as a power of the samples, as the pilot measured it
     seconds: float  # for one sample per pixel of the whole image
-    after: float  # seconds that the method takes
+    after: float  # seconds for what follows the render, such as the method
     adaptive: float = 1.0  # expected error of adaptive samples relative to even ones; 1: samples are even
-    choosing: float = 0.0  # seconds that the method takes each time that samples are distributed
-    doubt: float = 0.0  # standard error of a biased sampler's error, by which the error is raised; otherwise 0
+    choosing: float = 0.0  # seconds for each distribution of adaptive samples; 0 if samples are even
+    doubt: float = 0.0  # for biased samplers the standard error of ``error``, which is added to it twice; otherwise 0
 
     @property
     def shared(self) -> bool:
@@ -57,7 +62,7 @@ class Pipeline:
 
     @property
     def fall(self) -> float:
-        """The power of the samples by which the error falls."""
+        """The exponent of the error as a power of the number of samples."""
         usual = usual_fall(self.sampler, self.method)
         if self.method == "primal" or SAMPLERS[self.sampler].biased:
             return usual
@@ -65,16 +70,16 @@ class Pipeline:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the other samplers find too little of the light to judge this one."""
+        """Whether the other samplers find too little of the light to measure the error of this sampler."""
         return _DOUBT * self.doubt > self.error
 
     @property
     def gain(self) -> float:
-        """The error of adaptive samples relative to the error of as many even samples."""
+        """The error of adaptive samples relative to the error of the same number of even samples."""
         return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
 
     def samples(self, seconds: float) -> float:
-        """How many samples per pixel fit into the time; less than 1 if not even one fits."""
+        """How many samples per pixel fit into the time; less than 1 if not even one sample fits."""
         spp = (seconds - self.after) / self.seconds
         return spp - self._choices(spp) / self.seconds
 
@@ -82,7 +87,7 @@ class Pipeline:
         return spp * self.seconds + self._choices(spp) + self.after
 
     def _choices(self, spp: float) -> float:
-        """Seconds for distributing ``spp`` samples. Their number doubles each time that samples are distributed."""
+        """Seconds for distributing ``spp`` samples. The number of samples doubles at each distribution."""
         return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
 
     @property
@@ -95,13 +100,13 @@ class Pipeline:
         return max(1, 2 * batch if self.method == "wcv" else batch)
 
     def expected(self, spp: float) -> float:
-        """The error after this number of samples per pixel; infinite if they are fewer than ``least``."""
+        """The error after ``spp`` samples per pixel; infinite if ``spp`` is below ``least``."""
         if spp < self.least:
             return math.inf
         return self._begins * (spp / self.spp) ** self.fall
 
     def needed(self, error: float) -> float:
-        """The samples per pixel that are expected to leave the ``error``, at least ``least``."""
+        """The number of samples per pixel that is expected to leave this ``error``, but at least ``least``."""
         return max(self.least, self.spp * (error / self._begins) ** (1 / self.fall))
 
     @property
@@ -111,7 +116,7 @@ class Pipeline:
 
 
 def usual_fall(sampler: str, method: str) -> float:
-    """The power of the samples by which errors of a method usually fall, on stacks of the sampler."""
+    """The usual exponent of a method's error as a power of the number of samples, for stacks of the sampler."""
     if SAMPLERS[sampler].biased:
         return _BY_PHOTONS
     if method == "primal":
@@ -126,10 +131,10 @@ def measure(
     shared: bool = True,
     goes_on: Callable[[], bool] = lambda: True,
 ) -> list[Pipeline]:
-    """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
+    """Measures the pipelines of the ``trials``: for each sampler, all methods that run here and can use its stacks.
 
-    ``methods`` restricts the methods of each sampler. With ``shared``, samples are also distributed adaptively, else
-    only evenly. The first sampler gets at least one method, and all else is measured as long as it ``goes_on``.
+    ``methods`` restricts the methods of each sampler. With ``shared``, there are also pipelines with adaptive samples.
+    At least one method is measured for the first sampler. Everything else is measured only while ``goes_on()`` is true.
     """
     witnesses = Witnesses.of(trials)
     found: list[Pipeline] = []
@@ -150,7 +155,8 @@ def measure(
             if SAMPLERS[name].biased:
                 doubt = witnesses.doubt(name, double[0][0])
             else:
-                # The geometric mean of the error measured at twice the samples, and the error extrapolated to there
+                # The geometric mean of two errors at twice the samples: the measured error, and the error extrapolated
+                # from a single stack
                 two = math.sqrt(two * one * 2 ** usual_fall(name, method))
             pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)
@@ -164,7 +170,7 @@ def measure(
 
 
 def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, float]:
-    """The expected error of adaptive samples relative to even ones, and the seconds of each choice of counts."""
+    """The expected error of adaptive samples relative to even ones, and the seconds to distribute samples once."""
     method = Adaptive().chosen_by(stack)
     start = clock()
     found = assess(stack, method)
@@ -172,7 +178,7 @@ def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, floa
 
 
 def methods_for(sampler: str, only: str = "auto") -> list[str]:
-    """The methods that can reconstruct the sampler's stacks and run here."""
+    """The methods that run here and can reconstruct the sampler's stacks."""
     names: tuple[str, ...] = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
     if only != "auto":
         needs = runnable(only).needs

@@ -1,9 +1,10 @@
-"""Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
+"""Chooses the sampler, the number of samples and the reconstruction method by a *pilot*.
 
-``plan`` is for a given time and a method that makes the image: the least error wins. ``plan_sampler`` is for
-``--sampler auto`` if the method is not known: the least error wins again, with even samples and one simple method for
-each sampler. It chooses photons where they are clearly better, but not in scenes whose light only photons can find. A
-pilot cannot notice light that none of the samplers has found.
+The pilot consists of small renders by each sampler that could render the scene. ``plan`` is for a render whose time is
+given and whose image is made by a method. It chooses what leaves the least error. ``plan_sampler`` is for
+``--sampler auto`` if the method is not known. It compares samplers with even samples and one simple method for each
+sampler, and chooses the sampler that leaves the least error. It chooses photons where they are clearly better, but not
+in scenes whose light only photons can find. A pilot cannot notice light that none of the samplers has found.
 """
 
 from __future__ import annotations
@@ -29,30 +30,33 @@ from ngpt.errors import NgptError
 from ngpt.methods import METHODS, runnable
 from ngpt.system.console import brief
 
-# The share of the time that a pilot may take, and the part of its time for trials of samplers if it also tries methods
+# The share of the time that a pilot may take, and the part of the pilot's time for trials of samplers if it also tries
+# methods
 SHARE, _TRIALS = 0.1, 2 / 3
 # There is no pilot in renders of fewer seconds than this, or of fewer paths if the number of samples is given. A tenth
 # of the render must suffice to compile the kernels of other samplers and to try them. One or two cores trace a million
-# paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, with their methods about 4
-# more.
+# paths per second. Two trials on the smallest images take 3.0 to 13.5 processor seconds, and their methods about 4
+# seconds more.
 LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
-# Seconds that `ngpt render` and `ngpt denoise` take besides render and method: to start a process, and for each million
-# pixels to write the stack, to read it and to write the image
+# Seconds that `ngpt render` and `ngpt denoise` take besides rendering and the method: the time to start a process, and
+# the time per million pixels to write the stack, to read the stack and to write the image
 _BEGINS, _FILES = 0.8, 3.7
-# The time of methods grows by this power of the number of pixels. From 4,080 to 230,400 pixels it was 0.84
+# The time of methods grows by this power of the number of pixels. From 4,080 to 230,400 pixels, the power was 0.84
 # (ngpt-combine), 0.86 (oidn, ngpt-primal) and 0.96 (ngpt-fast), and from 57,600 pixels on 0.89 to 1.1. On small images
 # each call also takes some time that does not depend on the size.
 _GROWS = 0.9
-# Seconds for a million pixels, on two cores, of methods that no pilot has measured, and of methods that are not listed
+# Seconds that methods take for a million pixels on two cores, used if no pilot has measured them. The last number is
+# for methods that are not listed.
 _METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 14.0, "oidn": 13.0}, 3.0
 # In renders of at least LONG seconds the images of a pilot have PIXELS pixels. In shorter renders they have fewer, but
 # at least the share LEAST_PIXELS of that number.
 LONG, LEAST_PIXELS = 400.0, 1 / 16
-# Another sampler is chosen only if its error is smaller by this factor, since smaller differences could be chance.
-# Errors of networks and denoisers are foretold less well: in one choice they were wrong by a factor of 1.6.
+# Another sampler than the suggested one is chosen only if its error is smaller by the first factor, since smaller
+# differences could be chance. The second factor is for images by networks and denoisers. Predictions of their errors
+# are less reliable: in one choice they were wrong by a factor of 1.6.
 _MARGIN, _MARGIN_OF_IMAGES = 1.1, 1.6
 # Photons are taken if at least this share of the light is found only by them, and if this number of samples per pixel
-# fits into the time. On two cores a million samples take _CAUSTIC_SECONDS, and the first sample _CAUSTIC_BEGINS.
+# fits into the time. On two cores, photons take _CAUSTIC_BEGINS, and _CAUSTIC_SECONDS more for each million samples.
 _CAUSTIC_SHARE, _CAUSTIC_SPP = 0.02, 16
 _CAUSTIC_SECONDS, _CAUSTIC_BEGINS = 10.0, 8.0
 
@@ -64,7 +68,7 @@ class Plan:
     shared: bool  # whether samples are adaptive
     render: float | None  # seconds for the render, without pilot and method; None: as long as it takes
     reason: str  # a line for the user
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the sampler
+    options: Mapping[str, Any] = field(default_factory=dict)  # the sampler's options that differ from its defaults
 
 
 def explore(
@@ -79,8 +83,9 @@ def explore(
     """The pipelines of a scene, for an image of its size. ``plan`` chooses among them.
 
     The list is empty if no trial fits into its share of the ``seconds``. If ``patient``, the first sampler has a trial
-    and a method however long they take, and the sampler for gradients is tried, too. ``memory`` is in MiB. ``after`` of
-    a pipeline counts all that follows the render: its file, a process that reads it, the method, the image's file.
+    and a method however long they take, and the sampler for gradients is also tried. ``memory`` is in MiB. The seconds
+    ``after`` of a pipeline include everything that follows the render: writing the stack's file, starting a process
+    that reads this file, the method, and writing the image's file.
     """
     start = pilot.clock()
     able = _able(scene, method, gradients_too=patient)
@@ -105,13 +110,15 @@ def explore(
 
 
 def _beside(scene: mi.Scene) -> float:
-    """The seconds that processes and files take beside the method."""
+    """The seconds that starting a process, and reading and writing files, take besides the method."""
     return _BEGINS + _FILES * _pixels(scene) / 1e6
 
 
 def _able(scene: mi.Scene, method: str, gradients_too: bool = False) -> list[str]:
-    """The samplers to try: those whose stacks the method can use. The first is the one that the scene's description
-    suggests. ``gradients_too`` adds the one that it suggests if gradients are requested.
+    """The samplers to try, whose stacks the method can use.
+
+    The first is the sampler that the scene's description suggests. ``gradients_too`` adds the sampler that the
+    description suggests if gradients are requested.
     """
     needs_gradients = method != "auto" and "dx" in runnable(method).needs
     names = candidates(scene, gradients=needs_gradients)
@@ -129,13 +136,13 @@ def plan(
 ) -> Plan:
     """How to use the time of a ``request`` for a loaded ``scene``. The time includes the pilot and the method.
 
-    Only the requested method is considered, unless it is "auto". The pilot tries the sampler that the scene's
-    description stands for, then the other unbiased samplers that ``--sampler auto`` compares, as far as they fit into a
-    tenth of the time, compilation and methods included. The less time there is, the smaller are the pilot's images.
-    Another sampler is chosen only if it is expected to leave clearly less error. If there is no time for a pilot, or if
-    the pilot finds that nothing fits, the description decides, and the render takes the remaining time. A sampler that
-    gathers photons is taken without a pilot if a quick measurement finds much light that only photons find, and if
-    there is time for it. The measurements change from run to run.
+    Only the requested method is considered, unless it is "auto". The pilot first tries the sampler that the scene's
+    description suggests. Then it tries the other unbiased samplers that ``--sampler auto`` compares, as far as they fit
+    into a tenth of the time, including compilation and methods. The pilot's images are smaller if there is less time.
+    Another sampler than the suggested one is chosen only if it is expected to leave clearly less error. If there is no
+    time for a pilot, or if the pilot finds that nothing fits, the description decides, and the render takes the
+    remaining time. A sampler that gathers photons is taken without a pilot if a quick measurement finds much light that
+    only photons find, and if there is time for photons. The measurements change from run to run, so plans may too.
 
     Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
@@ -163,8 +170,9 @@ def plan(
 
 
 def _for_caustics(scene: mi.Scene, seconds: float, method: str, start: float, pilot: Pilot) -> Plan | None:
-    """The plan for a scene with light that paths from the camera hardly find. None if there is little such light, or no
-    time.
+    """The plan for a scene with much light that paths from the camera hardly find.
+
+    Returns None if there is little of this light, or not enough time for photons.
     """
     facts = scene_facts(scene)
     able = [name for name, entry in SAMPLERS.items() if entry.gathers and not entry.refuses(facts)]
@@ -189,14 +197,15 @@ def plan_sampler(
     request: RenderRequest,
     pilot: Pilot = Pilot(),  # noqa: B008 - it is frozen
 ) -> Plan:
-    """The sampler for the ``request`` of a loaded ``scene``. Samples, time or both end the render.
+    """The sampler for the ``request`` of a loaded ``scene``. The render is limited by samples, by time or by both.
 
-    The description decides, at no cost, where only one sampler can render the scene, and where the render is too short
-    for a pilot. If gradients are requested, only samplers that render them are considered. The measurements of a pilot
-    change from run to run, its choice hardly ever does. The render itself has the bits of ``--sampler NAME``.
+    If only one sampler can render the scene, or if the render is too short for a pilot, the scene's description decides
+    and nothing is tried. If gradients are requested, only samplers that render gradients are considered. The
+    measurements of a pilot change from run to run, but its choice hardly ever changes. The render itself gives the same
+    bits as with ``--sampler NAME``.
 
-    Raises NgptError if gradients are requested and no sampler can render them in this scene. Raises it before anything
-    is tried if the image does not fit into the memory.
+    Raises NgptError if gradients are requested and no sampler can render them in this scene. Also raises NgptError,
+    before anything is tried, if the image does not fit into the memory.
     """
     start, spp, seconds = pilot.clock(), request.budget.spp, request.budget.seconds
     sampler, method, reason = samplers.described(scene_facts(scene), request.gradients)
@@ -212,7 +221,7 @@ def plan_sampler(
     with at_most(scene, PIXELS) as scale:
 
         def whole(trials: dict[str, Trial]) -> float:
-            """Seconds of the render with the scene's own sampler; 0 where it cannot render the scene."""
+            """Seconds of the render with the suggested sampler; 0 if this sampler has no trial."""
             if sampler not in trials:
                 return 0.0
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
@@ -229,7 +238,7 @@ def plan_sampler(
 
 
 def plan_adaptive(scene: mi.Scene, request: RenderRequest) -> Plan:
-    """The plan for adaptive samples: the scene's description decides, and the ``request``'s method if it names one."""
+    """The plan for adaptive samples. The scene's description decides, or the ``request``'s method if it names one."""
     named = "" if request.method in (None, "auto") else str(request.method)
     gradients = request.gradients or bool(named and "dx" in runnable(named).needs)
     sampler, method, reason = samplers.described(scene_facts(scene), gradients)
@@ -237,7 +246,7 @@ def plan_adaptive(scene: mi.Scene, request: RenderRequest) -> Plan:
 
 
 def without_features(scene: mi.Scene, plan: Plan) -> Plan:
-    """The plan for an image whose stack nobody else uses: it renders albedo and normals only if they pay."""
+    """The ``plan`` for an image whose stack nobody else uses. Albedo and normals are rendered only if they pay."""
     if (plan.sampler, plan.method) != samplers.SIMPLE or features_pay(scene):
         return plan
     why = "the lens blurs albedo and normal, which are left out"
@@ -249,7 +258,7 @@ def _pixels(scene: mi.Scene) -> int:
 
 
 def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -> None:
-    """Raises NgptError where the image itself, which is larger than the pilot's, does not fit into ``memory`` (MiB)."""
+    """Raises NgptError if the image, which is larger than the pilot's images, does not fit into ``memory`` (MiB)."""
     entry = SAMPLERS[sampler]
     film_within(
         memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch, gradients=entry.film_of_gradients
@@ -257,7 +266,7 @@ def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -
 
 
 def simple(sampler: str) -> str:
-    """The method by which a sampler is compared with others if the method that will run is not known."""
+    """The method that is used to compare a sampler with others if the method that will run is not known."""
     if SAMPLERS[sampler].gradients:
         return "wcv"
     able = not SAMPLERS[sampler].biased and not METHODS["oidn"].missing()
@@ -265,8 +274,10 @@ def simple(sampler: str) -> str:
 
 
 def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin: float = _MARGIN_OF_IMAGES) -> Pipeline:
-    """The first of the ``ranked`` pipelines, or the best one of sampler ``default`` if its error is less than
-    ``margin`` times as large."""
+    """The first of the ``ranked`` pipelines, or the best pipeline of sampler ``default``.
+
+    The latter is returned if its error is less than ``margin`` times the error of the first.
+    """
     own = next((p for p in ranked if p.sampler == default), ranked[0])
     errors = [p.expected(p.samples(seconds)) for p in (ranked[0], own)]
     return own if errors[1] < margin * errors[0] else ranked[0]
@@ -275,8 +286,8 @@ def best_image(ranked: Sequence[Pipeline], default: str, seconds: float, margin:
 def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
     """The sampler for a render of this many ``seconds`` at the pilot's size, and the reason.
 
-    The first of ``pipelines`` has the sampler that the scene's description suggests. It is kept unless another is
-    expected to leave clearly less error.
+    The first of ``pipelines`` has the sampler that the scene's description suggests. This sampler is kept unless
+    another sampler is expected to leave clearly less error.
     """
     own = pipelines[0].sampler
     ranked = choose(pipelines, seconds)
@@ -290,7 +301,7 @@ def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
 
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
-    """A line with the expected error of the first pipeline, and of the best one of each other sampler."""
+    """A line with the expected error of the first pipeline, and of the best pipeline of each other sampler."""
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))

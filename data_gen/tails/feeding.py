@@ -1,14 +1,15 @@
-"""The number of paths that feed the cache, chosen so that the noise at equal time is least.
+"""Chooses the number of paths that feed the cache, so that the noise at equal time is least.
 
-The noise of a render has two parts. The own noise of each pixel falls with the number of paths of the image. The noise
-that pixels share falls with the number of paths that feed the cache. Let V and S be the variances that these two parts
-would have with one path each. If both kinds of paths cost the same, the variance at equal time is least for
+The noise of a render has two parts. Each pixel's own noise falls with the number of paths of the image. The noise that
+pixels share, because they read the same cells, falls with the number of paths that feed the cache. Let V be the
+variance that the own noise would have with one path of the image, and S the variance that the shared noise would have
+with one path that feeds the cache. If both kinds of paths cost the same, the variance at equal time is least for
 
     paths that feed / paths of the image = sqrt(S / V).
 
-V and S are measured over blocks of pixels, because a denoiser removes fine noise and leaves coarse noise. They are
-relative to the light, as errors are. The ratio is rounded to a power of two, so that it is nearly always the same in
-all renders of a scene.
+V and S are measured over blocks of pixels, because a denoiser removes fine noise and leaves coarse noise. Like errors,
+V and S are relative to the light. The ratio is rounded to a power of two, so that it is nearly always the same in all
+renders of a scene.
 """
 
 from __future__ import annotations
@@ -19,16 +20,17 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 
-# The number of paths that feed the cache for each path of the image: in the first round, at least, and at most
+# The number of paths that feed the cache for each path of the image: in the first round, and the least and the most in
+# later rounds
 BEGIN, LEAST, MOST = 1 / 2, 1 / 16, 1.0
 # The side of a block in pixels, and the share of the noisiest blocks that is left out
 _BLOCK, _TRIM = 16, 0.01
-# Noise is divided by the light of its block plus this share of the mean light, so dark blocks count less.
+# Noise is divided by the light of its block plus this share of the mean light, so the noise of dark blocks counts less.
 _DARK = 0.05
 
 
 def share(film: GradientFilm, fed: float) -> float | None:
-    """The number of paths that should feed the cache for each path of the image; None if it cannot be measured yet.
+    """How many paths should feed the cache for each path of the image; None if this cannot be measured yet.
 
     ``film`` holds the samples so far. ``fed`` is the number of paths per pixel that have fed the cache so far.
     """
@@ -53,7 +55,7 @@ def share(film: GradientFilm, fed: float) -> float | None:
 
 
 def _blocks(image: np.ndarray) -> np.ndarray:
-    """Means over blocks of an image (H, W, C); blocks at its borders may be smaller."""
+    """The means over the blocks of an image (H, W, C). Blocks at the image's borders may be smaller."""
     for axis in (0, 1):
         begins = np.arange(0, image.shape[axis], _BLOCK)
         counts = np.diff(np.append(begins, image.shape[axis]))

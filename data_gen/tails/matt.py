@@ -5,17 +5,17 @@ with a diffuse part scatters some of that light as a matt surface of reflectance
 
     f cos θ = ρ cos θ / π + rest.
 
-The path ends for the first term and goes on for the rest: gloss, metal, mirrors, transmission, and what bumps and
-Fresnel's law change about the diffuse part. Any ρ gives the right mean. The better ρ fits the material, the smaller is
-the rest. Nothing is divided by ρ, so ρ may be 0.
+For the first term the path ends, and the cache supplies the light. For the rest the path goes on: gloss, metal,
+mirrors, transmission, and what bumps and Fresnel's law change about the diffuse part. Any ρ gives the right mean, and a
+ρ that fits the material well makes the rest small. Nothing is divided by ρ, so ρ may be 0.
 
 In a medium the cache knows the mean radiance over all directions. A phase function is split in the same way,
 
     f = ρ / 4π + rest,
 
-where ρ is 4π times its least value, so that the rest is nowhere negative. The throughput of a path already includes the
-albedo. So a cell needs neither the extinction nor the albedo: thin and dense parts of a grid may share it, and so may
-both sides of an index-matched boundary.
+where ρ is 4π times the least value of the phase function f, so that the rest is nowhere negative. The throughput of a
+path already includes the albedo. So a cell needs neither the extinction nor the albedo: thin and dense parts of a grid
+may share a cell, and so may both sides of an index-matched boundary.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ from data_gen.paths import media
 from data_gen.paths.media import Place
 from data_gen.paths.vertex import SMOOTH, ByMaterial, dr_number, event_kind, materials_of
 
-# ρ is read from the value of a material in one direction. This is the tangent of the angle between that direction and
-# the normal: the direction is far from the horizon, and from the mirror direction on the other side of the normal.
+# ρ is computed from the value of a material for one outgoing direction. _TILT is the tangent of the angle between that
+# direction and the normal. The direction is far from the horizon, and also far from the mirror direction, which is on
+# the other side of the normal.
 _TILT = 1.0
-# Flags of all lobes but the diffuse reflection
+# The flags of all lobes except the diffuse reflection
 _ELSE = ("Delta", "Delta1D", "Null", "Glossy", "DiffuseTransmission")
-# The least ρ of a medium in which paths may end. With a smaller ρ nearly all paths would go on at each vertex.
+# The least ρ of a medium in which paths may end. With a smaller ρ, nearly all paths would go on at each vertex anyway.
 _LEAST_EVEN = 0.1
-# Materials that tilt the normal of the material inside
+# The class names of materials that tilt the normal of a nested material
 _BUMPS = re.compile("(Bump|Normal)Map")
 
 
@@ -53,7 +54,7 @@ class Matt:
         self.evens = ByMaterial(mi.Float(of_media))
         table = np.zeros(max(bsdfs, default=0) + 1, bool)
         table[[number for number, bsdf in bsdfs.items() if is_lambertian(bsdf)]] = True
-        # Materials inside shape groups are not listed.
+        # Materials inside shape groups are not in ``bsdfs``, so some of them may be matt.
         groups = any(shape.class_name() == "Instance" for shape in scene.shapes())
         matt = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection) for bsdf in bsdfs.values())
         self.any = groups or matt or bool(of_media.any())
@@ -66,12 +67,15 @@ class Matt:
         self.plain = MattTable(bsdfs)
 
     def at(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether a path may end here for the diffuse part of the material, or the even part of the phase function."""
+        """Whether a path may end at ``x``: for the diffuse part of a material, or the even part of a phase function."""
         matt = mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.DiffuseReflection)
         return active & (matt if place is None else matt | (self._even(place, active) > 0))
 
     def lambertian(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Bool:
-        """Whether a vertex scatters in no other way. Then a path that ends there has no rest to follow."""
+        """Whether the vertex scatters only like a matt surface, or evenly in a medium.
+
+        A path that ends at such a vertex has no rest to follow.
+        """
         listed, lambertian = self.nothing_else.of(x.bsdf(), active)
         all_matt = listed & lambertian
         return all_matt if place is None else all_matt | (self._even(place, active) == 1)
@@ -81,13 +85,19 @@ class Matt:
         return self.evens.of(place.medium, active & place.scatters)[1]
 
     def tilted(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether a bump or normal map may tilt the diffuse part, which then misses directions of a matt surface."""
+        """Whether a bump or normal map may tilt the diffuse part.
+
+        A tilted diffuse part scatters no light into some directions into which a matt surface scatters light.
+        """
         listed, tilted = self.tilts.of(x.bsdf(), active)
         return active & (~listed | tilted)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, place: Place | None, active: mi.Bool) -> mi.Color3f:
-        """ρ in [0, 1]. On a surface it is π times f of the diffuse lobe, in one direction on the side of ``wi``. In a
-        medium it is ρ of the phase function."""
+        """ρ in [0, 1].
+
+        On a surface ρ is π times f of the diffuse lobe, for one direction on the side of ``wi``. In a medium it is the
+        ρ of the phase function.
+        """
         on_surface = active & ~media.scatters(place)
         known, ρ = self.plain.of(x, on_surface)
         ρ = dr.select(known, ρ, reflectance(x.bsdf(), x, on_surface & ~known))
@@ -95,10 +105,13 @@ class Matt:
 
 
 class MattTable:
-    """A table of ρ for the sides of all matt materials without a texture. It is quicker than calls of the materials."""
+    """A table of ρ for both sides of all matt materials that have no texture.
+
+    Reading the table is faster than calling the materials.
+    """
 
     def __init__(self, bsdfs: dict[int, mi.BSDF]):
-        # By material and side: RGB, and 1 where it is known
+        # For each material and side: RGB of ρ, and 1 if ρ is known
         table = np.zeros((max(bsdfs, default=0) + 1, 2, 4), np.float32)
         x = dr.zeros(mi.SurfaceInteraction3f, 2)
         x.wi = mi.Vector3f(0, 0, mi.Float([1, -1]))
@@ -106,7 +119,7 @@ class MattTable:
             if is_lambertian(bsdf) and is_constant(bsdf):
                 table[number, :, :3] = np.array(reflectance(bsdf, x, mi.Bool(True))).T
                 table[number, :, 3] = 1
-        # Opaque: the numbers may differ between processes, and the kernel should not.
+        # The size is opaque: the numbers of materials may differ between processes, but the kernel should not.
         self.size, self.table = dr.opaque(mi.UInt32, len(table)), mi.Float(table.ravel())
         dr.eval(self.table)
 
@@ -121,7 +134,7 @@ class MattTable:
 def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
     """ρ in [0, 1], evaluated by the material: π times f of its diffuse lobe, see ``Matt.reflectance``."""
     context = mi.BSDFContext()
-    # With this mask materials of several lobes leave out the other lobes, except ``principled``.
+    # With this mask, all materials of several lobes except ``principled`` leave out the other lobes.
     context.type_mask = mi.BSDFFlags.DiffuseReflection
     along = mi.Vector2f(x.wi.x, x.wi.y)
     across = dr.rsqrt(dr.maximum(dr.squared_norm(along), 1e-12)) * along
@@ -132,7 +145,7 @@ def reflectance(bsdf: mi.BSDF | mi.BSDFPtr, x: mi.SurfaceInteraction3f, active: 
 
 
 def is_lambertian(bsdf: mi.BSDF) -> bool:
-    """Whether a material scatters only as a matt surface does, on one side or on both."""
+    """Whether a material scatters only like a matt surface, on one side or on both sides."""
     flags = bsdf.flags()
     more = any(mi.has_flag(flags, getattr(mi.BSDFFlags, name)) for name in _ELSE)
     known = bsdf.class_name() in ("SmoothDiffuse", "TwoSidedBRDF") and not _BUMPS.search(str(bsdf))
@@ -140,27 +153,28 @@ def is_lambertian(bsdf: mi.BSDF) -> bool:
 
 
 def is_constant(bsdf: mi.BSDF) -> bool:
-    """Whether a matt material has no texture: its only parameter is a reflectance."""
+    """Whether a matt material has no texture, so that all of its parameters are constant reflectances."""
     keys = list(mi.traverse(bsdf).keys())
     return bool(keys) and all(key.split(".")[-2:] == ["reflectance", "value"] for key in keys)
 
 
 def even_part(phase: mi.PhaseFunction) -> float:
-    """ρ of a phase function: 4π times its least value. Returns 0 where that is below ``_LEAST_EVEN`` or not known."""
+    """ρ of a phase function: 4π times its least value; 0 if that is below ``_LEAST_EVEN`` or not known."""
     name, ρ = phase.class_name(), 0.0
     if name == "IsotropicPhaseFunction":
         ρ = 1.0
     elif name == "RayleighPhaseFunction":
         ρ = 0.75
     elif name == "HGPhaseFunction":
-        # Read by element: a conversion to NumPy would evaluate the variable, and kernels could no longer be recorded.
+        # g is read as an element: a conversion to NumPy would evaluate the variable, and kernels could no longer be
+        # recorded.
         g = abs(float(mi.traverse(phase)["g"][0]))
         ρ = (1 - g) / (1 + g) ** 2
     return ρ if ρ >= _LEAST_EVEN else 0.0
 
 
 def matt_lobe(x: mi.SurfaceInteraction3f, place: Place | None, wo: mi.Vector3f) -> mi.Float:
-    """f cos θ of a matt surface of reflectance 1, on the side from which the path has come; 1 / 4π in a medium."""
+    """On a surface, f cos θ of a matt surface of reflectance 1, on the side of ``wi``. In a medium, 1 / 4π."""
     cosine = dr.maximum(dr.mulsign(wo.z, x.wi.z), 0) * dr.inv_pi
     return cosine if place is None else dr.select(place.scatters, dr.inv_four_pi, cosine)
 
@@ -180,10 +194,11 @@ def evaluate_and_sample(
     u: tuple[mi.Float, mi.Point2f],
     both: mi.Bool,
 ) -> tuple[mi.Spectrum, mi.Float, mi.BSDFSample3f, mi.Spectrum]:
-    """As ``data_gen.paths.media.evaluate_and_sample``, with two ways of sampling in the lanes of ``both``.
+    """As ``data_gen.paths.media.evaluate_and_sample``, but with two ways of sampling in the lanes of ``both``.
 
-    In these lanes half of the directions are sampled as at a matt surface, or evenly in a medium. Each density is the
-    mean over the two ways. ``u`` are the random numbers for the lobe and for the direction.
+    In these lanes, half of the directions are sampled with the density ``matt_lobe``, and the other half by the
+    material or phase function. Each density is the mean of these two densities. ``u`` are the random numbers for the
+    lobe and for the direction.
     """
     u_lobe, u_direction = u
     by_lobe = both & (u_lobe < 0.5)

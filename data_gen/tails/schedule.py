@@ -1,7 +1,8 @@
-"""When the cache is fed, and how fine its cells are. Both depend on the number of paths of the image so far.
+"""When the cache is fed, and how fine its cells are.
 
-So a large image has as many rounds as a small image with more samples. After the same number of paths the cache is the
-same, whether a number of samples or a time ends the render.
+Both depend only on the number of paths of the image so far. So a large image has as many rounds as a small image with
+the same number of paths. After the same number of paths the cache is the same, whether a number of samples or a time
+ends the render.
 """
 
 from __future__ import annotations
@@ -9,13 +10,14 @@ from __future__ import annotations
 import math
 
 # The cache begins when the image has this number of paths, or at once if the image has this number of pixels. Small
-# images of few samples have no cache: its kernels would take longer to compile than these images take to render.
+# images of few samples have no cache: compiling its kernels would take longer than rendering these images.
 BEGIN = 1 << 14
 # The least number of paths of the image at the end of the first round
 FIRST = 1 << 16
-# The fineness of cells says how many times smaller they are than the spread of a path. It is FINENESS at first. From
-# _COARSE paths of the image on, it grows as the power _RATE of their number. Bias falls with the square of the size of
-# cells, and so as fast as noise.
+# The fineness of cells says how many times smaller they are than the spread of a path, which is the width of the bundle
+# of similar paths (``data_gen.tails.cache``). The fineness is FINENESS at first. From _COARSE paths of the image on, it
+# grows as the power _RATE of the number of paths. The bias falls with the square of the size of cells, so it falls as
+# 1 / sqrt(paths), which is as fast as noise.
 FINENESS, _COARSE, _RATE = 8.0, 1 << 20, 1 / 4
 
 
@@ -25,12 +27,12 @@ def enough(pixels: int, spp: int | None) -> bool:
 
 
 def first_sample(pixels: int) -> int:
-    """The number of the first sample whose paths may end in the cache: a power of two, or 0 where images are large."""
+    """The number of the first sample whose paths may end in the cache: a power of two, or 0 for large images."""
     return 0 if pixels >= BEGIN else _power_of_two(BEGIN / pixels)
 
 
 def end_of_round(sample: int, pixels: int) -> int:
-    """The number of the first sample in the round after the one of ``sample``, which is at least ``first_sample``."""
+    """The number of the first sample after the round of ``sample``. ``sample`` is at least ``first_sample``."""
     return max(_power_of_two(FIRST / pixels), 1 << sample.bit_length())
 
 

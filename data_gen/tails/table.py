@@ -1,4 +1,4 @@
-"""A hash table of cells: cubes of a grid, which are further separated by the surface's direction and by kind."""
+"""A hash table of cells. A cell is a cube of a grid, further separated by the direction of surfaces and by kind."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import mitsuba as mi
 
 from data_gen.paths.streams import mixed
 
-# A cell is in one of this number of adjacent slots of the table. They are enough for each cell to find a free slot, in
-# whatever order cells are added.
+# The search for a cell looks at this number of adjacent slots of the table. This is enough for each cell to find a free
+# slot, in whatever order cells are added.
 _PLACES = 512
-# The number of directions along an axis of the octahedral map, and the code of cells in media, which have no direction
+# The number of directions along an axis of the octahedral map, and the code of cells in media, which have no direction.
 _DIRECTIONS = 8
 INSIDE = _DIRECTIONS**2
 
@@ -22,16 +22,17 @@ INSIDE = _DIRECTIONS**2
 class CellPlace:
     """The place of a vertex in the grid of the cache."""
 
-    p: mi.Point3f  # from the origin of the grid of its level
-    code: mi.UInt32  # direction of the normal on the side that is seen, and the kind of cell
-    level: mi.Int32  # the edge of cells is 2^level
+    p: mi.Point3f  # the position relative to the origin of the grid of its level
+    code: mi.UInt32  # the direction of the normal on the visible side, and the kind of cell
+    level: mi.Int32  # cells of a level have edges of length 2^level
 
 
 @dataclass
 class CellGrid:
-    """Where cells lie: the ``origin``, and the ``shift`` of the grid of each level from there, in edges of its cells.
+    """The position of the grids. There is one grid for each level.
 
-    Floats are finest near the origin. If the camera is there, cells beside it can be small, however large the scene is.
+    The origin of a level's grid is ``origin`` minus ``shift`` times the edge of its cells. Floats are finest near
+    ``origin``. If the camera is there, cells near the camera can be small, however large the scene is.
     """
 
     origin: mi.Point3f
@@ -39,7 +40,7 @@ class CellGrid:
 
     @classmethod
     def at(cls, origin: Sequence[float] = (0.0, 0.0, 0.0), shift: Sequence[float] = (0.0, 0.0, 0.0)) -> CellGrid:
-        # Opaque: they would be compiled into kernels, new ones for every seed.
+        # The values are opaque: as literals they would be compiled into kernels, so every seed would need new kernels.
         point, vector = ([dr.opaque(mi.Float, float(x)) for x in each] for each in (origin, shift))
         return cls(mi.Point3f(*point), mi.Vector3f(*vector))
 
@@ -49,20 +50,24 @@ class CellGrid:
 
 
 def octahedral(n: mi.Vector3f) -> mi.UInt32:
-    """The number of the cell of the sphere that ``n`` is in, below ``INSIDE``. [Meyer et al. 2010, "On floating-point
-    normal vectors"]"""
+    """The number of the cell of the octahedral map in which ``n`` lies, below ``INSIDE``.
+
+    [Meyer et al. 2010, "On floating-point normal vectors"]
+    """
     s = dr.rcp(dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
     u, v = n.x * s, n.y * s
     folded = n.z < 0
     u, v = dr.select(folded, (1 - dr.abs(v)) * dr.sign(u), u), dr.select(folded, (1 - dr.abs(u)) * dr.sign(v), v)
-    # Shifted a little, so that axes lie within cells and not between them.
+    # The map is shifted a little, so that the coordinate axes lie within cells and not on their borders.
     i, j = (mi.UInt32(dr.clip((w + 1) * 0.5 * _DIRECTIONS + 0.02, 0, _DIRECTIONS - 1)) for w in (u, v))
     return i + _DIRECTIONS * j
 
 
 def key(place: CellPlace) -> tuple[mi.UInt32, mi.UInt32, list[mi.Bool]]:
-    """A hash that says in which slot the search for the cell begins, the cell's check value, and whether the place is
-    in the upper half of the cell along each axis. The check value is never 0, which marks free slots."""
+    """A hash, the cell's check value, and whether the place is in the upper half of the cell along each axis.
+
+    The search for the cell begins at the slot of the hash. The check value is never 0, because 0 marks free slots.
+    """
     q = place.p * dr.exp2(mi.Float(-place.level))
     corner = [dr.floor(q[i]) for i in range(3)]
     x, y, z = (mi.UInt32(mi.Int32(c)) for c in corner)
@@ -77,8 +82,7 @@ def in_table(
 ) -> tuple[mi.UInt32, mi.Bool]:
     """The slots of cells in a table, and which cells have a slot. With ``fill``, cells without a slot get a free one.
 
-    ``h`` and ``name`` are the first two values of ``key``. The slots from ``h`` on are searched, up to the first free
-    one.
+    ``h`` and ``name`` are the first two values of ``key``. The search goes from slot ``h`` to the first free slot.
     """
     last, lanes = dr.width(keys) - 1, dr.width(h)
 
