@@ -26,8 +26,8 @@ class Verb(NamedTuple):
     """A verb of the command line.
 
     ``summary``      one line for help
-    ``room``         the package that holds its module, which has the name of the verb
-    ``extra``        the extra of ngpt-recon that installs its dependencies; "" if it needs none
+    ``room``         the package that holds the verb's module; the module has the name of the verb
+    ``extra``        the extra of ngpt-recon that installs the verb's dependencies; "" if it needs none
     ``interrupted``  the message after an interrupt
     ``heading``      the heading in help, one of ``HEADINGS``
     """
@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     # The verb is the first word that is not an option. Only --completion takes a value, and it needs no verb.
     called = "" if words[:1] == ["--completion"] else next((word for word in words if not word.startswith("-")), "")
-    # A search for the verbs of other packages takes time, so it is made only if needed.
+    # The search for the verbs of other packages takes time, so they are searched only if needed.
     verbs = VERBS if called in VERBS else all_verbs()
     interrupted = verbs[called].interrupted if called in verbs else "interrupted"
     return run_command(lambda: _work(_parser(called, verbs), verbs, words, "ngpt"), interrupted=interrupted)
@@ -149,8 +149,8 @@ def door(
     """Runs a verb for a script of the repository, such as ``train.py``, and returns the exit status.
 
     ``program``    the command as help shows it: "python train.py"
-    ``arguments``  the words after it; None for those of this process
-    ``name``       the beginning of its error messages
+    ``arguments``  the words after the command; None for the words that this process was started with
+    ``name``       the beginning of the verb's error messages
     ``verbs``      a dictionary with the verb, for packages that are not installed
     """
     words = sys.argv[1:] if arguments is None else arguments
@@ -187,7 +187,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
 
 
 def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.ArgumentParser:
-    """The ``parser``, to which the description and the arguments of a verb were added."""
+    """Adds the description and the arguments of a verb to the ``parser``, and returns it."""
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
     parser.set_defaults(verb=name, parser=parser)
     loud = parser.add_mutually_exclusive_group()

@@ -178,7 +178,7 @@ def relative(text: str) -> float:
 
 
 def number(text: str, fits: Callable[[float], bool], refusal: str) -> float:
-    """The number in a text. If there is none, or it does not fit, the error quotes the text and ends in ``refusal``."""
+    """The number in a text. If the text is no number that ``fits``, the error quotes it and ends in ``refusal``."""
     try:
         found = float(text)
     except ValueError:
@@ -192,7 +192,7 @@ def stack_files(names: list[str]) -> list[Path]:
     """The files given by their names, by folders (every .exr in them) or by patterns, in order and without repeats.
 
     Results of earlier runs in folders and patterns are left out (``ngpt.io.frames``). Raises NgptError for a folder or
-    pattern without a file. A file that is named need not exist: its reader reports the error.
+    pattern without a file. A file given by its name need not exist, since reading it later reports the error.
     """
     files = [path for name in names for path in (input_files(name) if is_shot(name) else [Path(name)])]
     return list(dict.fromkeys(files))

@@ -4,7 +4,7 @@ import argparse
 import re
 from collections.abc import Iterable
 
-# The names of values in help by which options that take a file or a folder are recognised
+# An option takes a file or a folder if help gives its value one of these names.
 _FILES = re.compile(r"FILE|OUT|REF|PATH|DIR|FOLDER|PAGE|CONFIG|\.\w+$")
 
 

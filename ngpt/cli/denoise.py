@@ -129,7 +129,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def denoise(request: DenoiseRequest, as_json: bool, console: Console) -> int:
     """Makes and writes all results, and reports them as lines or as JSON. Returns the exit status."""
     pairs, reports = request.pairs, []
-    # One stack has no progress to report, but a user who watches sees that it is being denoised.
+    # A single stack has no progress to report. On a terminal, a bar still shows that the stack is being denoised.
     shows_bar = len(pairs) > 1 or console.terminal
     bar = console.progress("denoise", "frames") if shows_bar else nullcontext(lambda done, total: None)
     with bar as progress, closing(results(request, console)) as outcomes:
@@ -146,7 +146,7 @@ def denoise(request: DenoiseRequest, as_json: bool, console: Console) -> int:
             progress(i, len(pairs))
     if request.temporal and (hint := motion_hint(request, reports)):
         console.say(hint)
-    # The result does not show that features went unrecognized.
+    # Users cannot see in the result that features were not recognized, so a message tells them.
     overlooked: dict = next((report for report in reports if report.get("proposed")), {"proposed": {}})
     for name, layer in overlooked["proposed"].items():
         hint = f"'{layer}' looks like {name} and was not used; --layer {name}=\"{layer}\" takes it"
@@ -163,7 +163,7 @@ def denoise(request: DenoiseRequest, as_json: bool, console: Console) -> int:
 
 
 def results(request: DenoiseRequest, console: Console) -> Any:
-    """Makes and writes the result of each pair: a generator of the report, or the error, of each."""
+    """Returns a generator that makes and writes the result of each pair, and yields its report or its error."""
     pairs, again = request.pairs, set[Path]()
     missing = [i for i, (_, target) in enumerate(pairs) if not (request.skip_existing and finished(target))]
     windows = False
@@ -173,7 +173,7 @@ def results(request: DenoiseRequest, console: Console) -> Any:
         for name in filter(is_shot, request.stacks):
             for remark in remarks(name, arguments.stack_files([name]), results=False):
                 console.say(remark)
-        # These results may exist, but later frames need their history.
+        # These frames are read even if their results exist, because other frames need them.
         again = {target for _, target in (pairs if windows else pairs[: missing[-1]])}
     read = partial(read_frame, request=request, again=again)
     write = partial(write_frame, request=request)
@@ -184,9 +184,9 @@ def results(request: DenoiseRequest, console: Console) -> Any:
 
 
 def read_frame(pair: tuple[Path, Path], request: DenoiseRequest, again: Container[Path]) -> Frame:
-    """Reads a frame. ``again`` contains existing results to make again, because later frames build on them."""
+    """Reads a frame. A frame whose result exists is read only if the result is in ``again``: other frames need it."""
     source, target = pair
-    # Checked only now, because several machines may work on one folder.
+    # Whether the result exists is checked only now, because several machines may work on one folder.
     exists = request.skip_existing and finished(target)
     if exists and target.suffix.lower() == ".exr":
         _check_result(source, target, request)

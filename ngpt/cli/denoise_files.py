@@ -33,13 +33,13 @@ class View:
 
     @property
     def name(self) -> str:
-        """ "" in a file without views."""
+        """The name of the view; "" in a file without views."""
         return self.stack.source.view.name if self.stack.source is not None else ""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A file to denoise, the file for its result, and its views; without views, the frame is skipped.
+    """A file to denoise, the file for its result, and its views. A frame without views is skipped.
 
     ``exists``               whether the result existed already
     ``replaces_incomplete``  whether the result replaces an incomplete file
@@ -55,8 +55,8 @@ class Frame:
 def write_frame(frame: Frame, request: DenoiseRequest) -> dict:
     """Writes the result, and returns its report.
 
-    If a single result cannot be written to its place, it is written elsewhere. One of several frames is not: the next
-    call makes it again.
+    If the result of a single stack cannot be written to its place, it is written elsewhere. The result of one of
+    several stacks is not written elsewhere, because the next call makes it again.
     """
     target = frame.target
     report: dict[str, Any] = {"input": str(frame.source), "output": str(target)}

@@ -20,13 +20,14 @@ from ngpt.result_file import Look, check_image
 class DenoiseRequest:
     """The files to denoise, how to denoise them, and how to write the results.
 
-    Most fields are options of ``ngpt denoise``, which says what they mean. These are not:
+    Most fields are options of ``ngpt denoise``, whose help explains them. The other fields are:
 
     ``pairs``      the file of each stack, and the file for its result
     ``options``    the options of the method, which may be texts
     ``layer``      names of layers in the files, by the names of the contract, as for ``ngpt.read``
     ``files``      separate files of layers, by the names of the contract; only for a single stack
-    ``groups``     patterns of the light groups that are denoised too; () for those of known renderers; None for none
+    ``groups``     patterns of the light groups that are denoised too; () for the groups of known renderers; None for no
+                   groups
     ``reference``  the image that results are compared with
     ``look``       how pictures show light
     """
@@ -53,7 +54,7 @@ class DenoiseRequest:
 
 
 def request_of(args: argparse.Namespace) -> DenoiseRequest:
-    """The request of a command line. Raises an error if no stack could meet it, or a result could not be written."""
+    """The request of a command line. Raises an error if it fits no stack, or if a result could not be written."""
     pairs, files = output_paths(arguments.stack_files(args.stacks), args.output), arguments.given_files(args)
     if len(pairs) > 1 and (files or args.halves):
         of_one = f"--{next(iter(files))} belongs" if files else "--halves belong"
@@ -82,7 +83,7 @@ def request_of(args: argparse.Namespace) -> DenoiseRequest:
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Each source with the file for its result, by ``--output``. Raises WrongUse if two would have the same file."""
+    """Each source with the file for its result, as ``--output`` says. Raises WrongUse if two results had one file."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
     elif varies(output):

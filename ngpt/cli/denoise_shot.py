@@ -1,4 +1,8 @@
-"""``ngpt denoise --temporal``: the choice between history and windows, and reconstruction by windows of frames."""
+"""``ngpt denoise --temporal``: chooses between history and windows of frames, and reconstructs shots by windows.
+
+With history, each result is blended with the results before it. With windows, several frames are reconstructed
+together.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -15,11 +19,11 @@ from ngpt.stack import GradientStack
 
 
 def choose_blending(request: DenoiseRequest) -> tuple[bool, str]:
-    """Whether windows of frames reconstruct the shot, and a message about how it is blended.
+    """Returns whether windows of frames are used for the shot, and a message about how its frames are blended.
 
-    Windows do so if the method is ``wcv`` without options, and all frames but the first have the layers that lead to
-    the previous frame. The layers are known from the headers of all files. Files that cannot be read are ignored here:
-    each one counts as a cut, and is reported when it is processed.
+    Windows are used if the method is ``wcv`` without options, and if all frames but the first have the layers that lead
+    to the previous frame. The layers are read from the headers of all files. Files that cannot be read are ignored
+    here. Each of them counts as a cut, and is reported when it is processed.
     """
     history = "history, each frame by those before it"
     if request.method != "wcv" or request.options:
@@ -38,7 +42,7 @@ def choose_blending(request: DenoiseRequest) -> tuple[bool, str]:
 
 
 def motion_hint(request: DenoiseRequest, reports: Sequence[dict]) -> str:
-    """The message about a shot without motion, and about layers that may hold it; "" for a shot with motion."""
+    """The message about a shot without motion, and about layers that may hold motion; "" for a shot with motion."""
     why = [report["why no history"] for report in reports[1:] if "why no history" in report]
     if not why or any(reason != NO_MOTION for reason in why):
         return ""
@@ -82,7 +86,7 @@ def windowed(
             yield frames[number].views[0].stack
 
     def reports_until(last: int) -> Iterator[dict | NgptError]:
-        """The reports on frames without a new result, up to the frame ``last``."""
+        """Yields the reports on frames without a new result that come before the frame ``last``."""
         for number in range(done, last):
             yield errors[number] if number in errors else write(frames.pop(number))
 

@@ -122,7 +122,7 @@ def method(name: str) -> dict:
 
 
 def other(name: str, parameters: dict[str, str]) -> dict:
-    """The description of a method, a sampler, or a scene and how it would be rendered.
+    """The description of a method, a sampler or a scene; for a scene, also how it would be rendered.
 
     Raises NgptError for a name that is none of these.
     """
@@ -239,7 +239,7 @@ def show(report: dict, as_json: bool) -> None:
 
 
 def _fields(text: str) -> object:
-    """The fields of a render's request in a header that are set; the text itself if it is no such request."""
+    """The fields that are set in a render's request, from its text in a header; the text itself if it is no request."""
     try:
         fields = parse_json(text, REQUEST)
     except NgptError:
@@ -248,7 +248,7 @@ def _fields(text: str) -> object:
 
 
 def _fitted(line: str, indent: int) -> None:
-    """Prints a line. A terminal breaks it between words, and further lines are indented by ``indent`` spaces."""
+    """Prints a line. On a terminal, it is broken between words, and further lines are indented by ``indent`` spaces."""
     if sys.stdout.isatty():
         width, start = shutil.get_terminal_size().columns, len(line) - len(line.lstrip())
         wrapper = textwrap.TextWrapper(width, " " * start, " " * indent, break_long_words=False, break_on_hyphens=False)
@@ -264,5 +264,5 @@ def _number(value: object) -> str:
 
 
 def _plain(value):
-    """A header attribute as a value that JSON has."""
+    """Converts a header attribute to a value that JSON can hold."""
     return value if isinstance(value, bool | int | float | str) else " ".join(str(value).split())

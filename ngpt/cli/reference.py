@@ -1,4 +1,4 @@
-"""``ngpt denoise --ref``: the error of a result, in the pixels that both it and the reference have."""
+"""``ngpt denoise --ref``: the error of a result, in the pixels that both the result and the reference have."""
 
 from typing import Any, NamedTuple
 

@@ -223,9 +223,10 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
 
 
 def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
-    """The files of each frame, one of every shot, in the order of the first. Raises NgptError if a shot lacks a frame.
+    """The files of each frame, one from each shot, in the order of the first shot.
 
-    Frames are matched by the names of their files, or by their numbers if all shots are names with a field for these.
+    Frames are matched by the names of their files, or by their numbers if all shots are names with a field for the
+    number. Raises NgptError if a shot lacks a frame.
     """
     found: list[dict[Any, Path]] = [{frame_name(path): path for path in files} for files in shots]
     if all(map(varies, folders)):
@@ -241,7 +242,7 @@ def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, .
 
 
 def labels(paths: list[str]) -> list[str]:
-    """A name for each file: its own without the ending, after as many folders as make all names differ."""
+    """Names each file by its own name without the ending, after as many folders as are needed to make names differ."""
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:

@@ -36,8 +36,8 @@ def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
 def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str], str | None]]:
     """Yields the names of inputs and output, with ``-`` replaced by the names of files, since OpenEXR needs files.
 
-    Standard input is read before the block. The output file goes to standard output after it. Raises NgptError for
-    ``-`` beside other inputs or without an output, and for an image that would go to a terminal.
+    Standard input is read before the block. After the block, the output file is copied to standard output. Raises
+    NgptError for ``-`` beside other inputs or without an output, and for an image that would go to a terminal.
     """
     if STREAM in stacks and len(stacks) > 1:
         raise NgptError(f"'{STREAM}' is one stack, and {len(stacks)} are given; denoise them one by one")
@@ -57,7 +57,7 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
                 with called(str(target), "standard output"):
                     yield inputs, str(target)
             finally:
-                # Also after a failed render, which has written the samples that it finished.
+                # This is done after a failed render too, which has written the samples that it finished.
                 if target.exists():
                     with target.open("rb") as file:
                         shutil.copyfileobj(file, sys.stdout.buffer)

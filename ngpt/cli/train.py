@@ -87,7 +87,7 @@ def _on_disk(settings: Any) -> list[str]:
 
 
 def _task(settings: Any, out: Path, stack: ExitStack, processes: Any, say: Callable[[str], None]) -> Any:
-    """The task of the settings with its data; ``stack`` ends the rendering of training sets."""
+    """The task of the settings with its data. When ``stack`` is closed, the rendering of training sets ends."""
     from ngpt.system.parts import find_crops
     from ngpt.training.clips import clips
     from ngpt.training.crops import JoinedCrops, open_crops

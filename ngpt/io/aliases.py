@@ -24,7 +24,8 @@ class Alias(NamedTuple):
     writer: str = ""
 
 
-# Names of the contract that other programs use for other layers -> layers that only files of ngpt hold beside them
+# Names of the contract that other programs give to other layers -> layers that only ngpt writes. A file of ngpt holds
+# at least one of these beside the named layer.
 OWN: dict[str, set[str]] = {
     "direct": {"dx", "dy"},
     "caustic": {"dx", "dy", "caustic_var"},
@@ -33,9 +34,9 @@ OWN: dict[str, set[str]] = {
     "shared": {"primal_var"},
 }
 
-# The first name that a file holds is taken. Some names are left out on purpose: pbrt-v4's `Variance` and Mitsuba's
-# moments are variances of a sample, not of the pixel mean; `diffuse` is light in half of the other renderers; V-Ray's
-# VRayZDepth is a shade of grey between two distances.
+# Of the names of a layer, the first that a file holds is taken. Some names are left out on purpose: pbrt-v4's
+# `Variance` and Mitsuba's moments are variances of a sample, not of the pixel mean; `diffuse` is light in half of the
+# other renderers; V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
     *(Alias(name, "ngpt", name) for name in LAYERS if name not in (*OWN, "error")),
     Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
@@ -85,8 +86,9 @@ ALIASES: tuple[Alias, ...] = (
     Alias("alpha", "RenderMan", "a"),
 )
 
-# Parts of names (in lower case without blanks and underscores) by which a layer is proposed to the user. Only the user
-# knows the direction and unit of most motion vectors.
+# A layer is only proposed to the user if its name in the file contains one of these parts (in lower case without blanks
+# and underscores). It is not used at once because, for example, only the user knows the direction and unit of most
+# motion vectors.
 LOOKS = {
     "albedo": ("albedo", "diffusefilter", "diffusecol", "basecol", "diffcol", "reflectance"),
     "normal": ("normal",),
@@ -95,7 +97,7 @@ LOOKS = {
     "dy": ("gradienty", "grady"),
     "motion": ("motionvec", "velocity", "vector"),
 }
-# Parts of names for which these layers are not proposed
+# A layer is not proposed if its name in the file contains one of these parts.
 NOT_LOOKS = {"depth": ("zdepth",)}
 # Parts of the names of layers that are not light although their channels are R G B
 NO_LIGHT = ("crypto", "position", "matte", "mask", "noise", "samples")

@@ -108,7 +108,7 @@ def _resolved(
     """The places of the layers of a view in its file; ``attributes`` are the headers of the parts."""
     headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
-    # A result file keeps the input in another layer than the one that it came from.
+    # In a result file, the input is in another layer than the one that it was first read from.
     if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):
         del wanted["primal"]
     writer = writer_of(name for header in headers for name in header)
@@ -240,7 +240,7 @@ def write(
                     results of all views of a file
     ``like``        the stack that the result was made from; or a list of the stacks of the views (``read_views``)
     ``attributes``  header attributes, which are added to those of the stack; for a result, ``Result.attributes``
-    ``into``        the layer that a result replaces beside the root; "root" for none
+    ``into``        the layer that a result replaces in addition to the root; "root" for no further layer
     ``reduce``      K: each K x K pixels of a result become one, by the rules of ``ngpt.io.reduced``
 
     A stack that was read from a file is written as that file, with its layers and attributes brought up to date. Any
@@ -250,10 +250,10 @@ def write(
     A result is written as the file of its stack, with ``image`` in the root R G B of the first part, which viewers
     show, and with the input in primal.R/G/B. If the first part does not hold primal, or shows another layer in its
     root, it is not changed, and a new part goes in front. Alpha is copied into the root if the file has it elsewhere.
-    By default, ``image`` also replaces the layer that the input was read from, such as ``ViewLayer.Combined``, unless
-    its name says that it is noisy; the attribute ``ngpt:pass`` then names that layer. If the stack is itself a result,
-    its attributes on how it was made (``MADE_BY``) and its layer ``error`` are left out. A new layer ``error``
-    (``like=stack.replace(error=...)``) is written.
+    By default, ``image`` also replaces the layer that the input was read from, such as ``ViewLayer.Combined``, and the
+    attribute ``ngpt:pass`` names that layer. The layer is not replaced if its name says that it is noisy. If the stack
+    is itself a result, its attributes on how it was made (``MADE_BY``) and its layer ``error`` are left out. A new
+    layer ``error`` (``like=stack.replace(error=...)``) is written.
 
     Channels keep their type, half or float, and become float if half cannot hold the values (above 65504, or all below
     6.1e-5). Gradients, variances and depth are written as float.
@@ -275,7 +275,7 @@ def write(
         attributes = {**(attributes or {}), REDUCED: reduce}
     pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
     pairs = pairs or list(zip(image, like, strict=True))  # type: ignore[arg-type]
-    # The first view may get a part in front of all others, which changes their numbers.
+    # The first view comes last: it may get a part in front of all others, which changes the numbers of their parts.
     pairs.sort(key=lambda pair: pair[1].source is None or pair[1].source.view.first == 0)
     if reduce != 1:
         pairs = [(one, replace(stack, fine={})) for one, stack in pairs]
@@ -324,7 +324,7 @@ def _result(
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
-    """The ``stack``, which must not come from a file, with further channels, (H, W) each, that ``write`` writes too.
+    """Returns the ``stack``, which must not come from a file, with further channels (H, W) for ``write``.
 
     Their names, such as ``diagnostics.discarded``, are outside the contract. ``pass_through`` returns these channels
     like the unknown channels of a file.

@@ -1,6 +1,6 @@
 """Subpixels in files: one more part, ``fine``, which other readers may ignore.
 
-It holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z``. Its data window is K times the data window of the pixels, and the
+This part holds R G B, ``albedo.R/G/B`` and ``normal.X/Y/Z``. Its data window is K times that of the pixels, and the
 attribute ``ngpt:subpixels`` holds K. Its display window is not multiplied, because OpenEXR requires the same display
 window in all parts of a file.
 """
@@ -21,7 +21,7 @@ from ngpt.subpixels import FINE, HALF, SUBPIXELS, belong
 _LOG = logging.getLogger(__name__)
 
 PART = "fine"
-# The name for the part with the pixels if it has none, since each part of several needs one
+# The name for the part with the pixels if it has no name: in a file of several parts, each part needs a name.
 _PIXELS = "stack"
 # Attributes that OpenEXR requires to be the same in all parts of a file
 _COMMON = ("displayWindow", "pixelAspectRatio", "timeCode", "chromaticities")

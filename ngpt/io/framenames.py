@@ -12,7 +12,8 @@ from pathlib import Path
 from ngpt.errors import NgptError, WrongUse
 
 _FIELD = re.compile(r"%(?:0(\d))?d|(##+)|\$F(\d?)|<frame>|\{frame(?::0(\d)d)?\}")
-# A number in a name. A minus belongs to it at the start of a name and after a dot or an underscore: "f.-2", not "f-2".
+# A number in a name. A minus belongs to the number only at the start of a name and after a dot or an underscore: in
+# "f.-2", but not in "f-2".
 NUMBER = re.compile(r"((?:(?<![^._/\\])-)?[0-9]+)")
 
 

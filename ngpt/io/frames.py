@@ -59,7 +59,7 @@ def input_files(name: str) -> list[Path]:
 
 
 def without_results(files: Sequence[Path]) -> list[Path]:
-    """The files, without results whose inputs are also among them."""
+    """The files without those results whose inputs are also among the files."""
     results = {path.with_name(f"{path.stem}{RESULT_SUFFIX}{path.suffix}") for path in files}
     return [path for path in files if path not in results]
 
@@ -88,7 +88,8 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 def series(files: Iterable[Path]) -> list[Series]:
     """The series among files, in natural order of their first names.
 
-    If a name has several numbers, like ``take2.0007``, the last one that differs among similar names is the frame's.
+    If a name has several numbers, like ``take2.0007``, the frame's number is the last one that differs among similar
+    names.
     """
     alike: dict[str, list[Path]] = {}
     for path in sorted(files, key=natural):
@@ -112,7 +113,7 @@ def series(files: Iterable[Path]) -> list[Series]:
 def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
     """Warnings about the frames of a shot, one line each: omitted results, several series, missing numbers.
 
-    ``name`` is the folder or pattern, ``files`` are its frames. ``results`` is whether omitted results are counted.
+    ``name`` is the folder or pattern, ``files`` are its frames. ``results`` says whether omitted results are reported.
     """
     lines = []
     if left := len(set(_files(name)) - set(files)) if results else 0:

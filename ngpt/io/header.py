@@ -88,8 +88,8 @@ class PartHeader:
 def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
     """The headers of the parts of an open file.
 
-    Raises NgptError if the file is not OpenEXR, if a header is damaged or does not fit the length of the file, if it
-    exceeds a limit above, and if the pixels would need more than half of the memory.
+    Raises NgptError if the file is not OpenEXR, if a header is damaged, exceeds a limit above or does not fit the
+    length of the file, and if the pixels would need more than half of the memory.
     """
     magic = file.read(4)
     if not magic:

@@ -20,7 +20,8 @@ from ngpt.io.openexr import ExrImage, read_exr, write_exr
 from ngpt.system.limits import limit_address_space
 from ngpt.system.reading import regular_file
 
-# Bytes added to three times the size of the pixels, for Python, NumPy and the stacks of OpenEXR's threads.
+# The other process may use three times the size of the pixels, and this number of bytes for Python, NumPy and the
+# stacks of OpenEXR's threads.
 _BASE = 2**31
 _SECONDS = 30.0  # plus the time to read the file at 10 MB/s
 _REFUSED = 3

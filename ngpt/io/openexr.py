@@ -5,9 +5,9 @@ line order are kept. There are four exceptions (docs/use/gradient-stack.md): los
 full-size level of a mipmap is kept, attributes that are empty lists are dropped, and rationals are reduced (48/2
 becomes 24/1).
 
-Deep images and subsampled channels are refused. OpenEXR holds whole files in memory. It would return only the readable
-parts of a damaged file; here a damaged file is an error. While a file is read, output of other threads to stdout or
-stderr is lost, because OpenEXR's own messages are suppressed there.
+Deep images and subsampled channels are refused. OpenEXR holds whole files in memory. Of a damaged file, OpenEXR itself
+would return only the readable parts; here a damaged file is an error. While a file is read, output of other threads to
+stdout or stderr is lost, because OpenEXR's own messages are suppressed there.
 """
 
 import contextlib
@@ -95,7 +95,7 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
         try:
             parts = _decode(file, path, headers)
         finally:
-            # A change is the cause of any other error, so it is reported instead.
+            # A change of the file is the cause of any other error, so the change is reported instead.
             if _state(file) != before:
                 raise NgptError(f"{path}: changed while it was read; wait until its writer is done, and read it again")
     return ExrImage(
@@ -143,18 +143,18 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
 
 
 def _reason(error: Exception, name: str, path: Path) -> str:
-    """The first line of an error of OpenEXR, in which ``name``, as given to OpenEXR, is replaced by the file\'s own."""
+    """The first line of OpenEXR's error; the ``name`` that OpenEXR was given is replaced by the file's own name."""
     return (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
 
 
 def _numbered(file: BinaryIO) -> str:
-    """A name for an open file. Its own may belong to another file by now, or OpenEXR may be unable to encode it."""
+    """A name for an open file. Its own name may belong to another file by now, or OpenEXR may fail to encode it."""
     return str(_NUMBERS / str(file.fileno())) if _NUMBERS.is_dir() else str(file.name)
 
 
 @contextlib.contextmanager
 def _name_to_write(path: Path) -> Iterator[str]:
-    """``_numbered`` for a file to write; on systems without numbers, the file's own name, and the file stays closed."""
+    """Yields ``_numbered`` of a file to write. Without such names, yields the file's own name, and it stays closed."""
     if _NUMBERS.is_dir():
         with open(path, "r+b") as file:
             yield _numbered(file)
@@ -182,7 +182,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
     except Exception as error:
         reason = _reason(error, name, path)
         raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
-    # If OpenEXR reads other sizes than ``ngpt.io.header``, the limits were not checked for these.
+    # If OpenEXR reads other sizes than ``ngpt.io.header``, the limits were not checked for what OpenEXR reads.
     expected = [({*header.channels}, {header.size[::-1]}) for header in headers]
     got = [({*part.channels}, {channel.pixels.shape for channel in part.channels.values()}) for part in parts]
     if got != expected:
@@ -214,8 +214,8 @@ def _without_native_stderr() -> Iterator[None]:
 def _all_cores() -> Iterator[None]:
     """Lets OpenEXR use all cores in the block, which is not its default. Its threads end with the block.
 
-    A process that was forked later would wait for them forever. If address space is short, no threads are made. A
-    number of threads that the program has set is not changed.
+    If they did not end, a process that is forked later would wait for them forever. If address space is short, no
+    threads are made. If the program has set a number of threads, it is not changed.
     """
     short = free_address_space() < processors() * _THREAD
     if short or OpenEXR.global_thread_count():
@@ -258,7 +258,7 @@ def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any],
 
 
 def _attribute(name: str, value: Any, path: str) -> Any:
-    """The ``value`` in a form that OpenEXR stores unchanged; it silently wraps, drops or transposes other forms."""
+    """The ``value`` in a form that OpenEXR stores unchanged. OpenEXR wraps, drops or transposes others silently."""
     value = _plain(value)
     if not _fits(value):
         raise NgptError(

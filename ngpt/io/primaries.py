@@ -47,8 +47,8 @@ _SAME = 1e-4  # the tolerance of coordinates: standards give four digits
 def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
     """The matrix (3, 3) that converts colours of a file with these header attributes to linear Rec. 709.
 
-    Returns None if the file is in Rec. 709 or its header names no primaries; or, with a warning, if they make no sense.
-    If the whites differ, one is adapted to the other by Bradford's method.
+    Returns None if the file is in Rec. 709, if its header names no primaries, or (with a warning) if the primaries make
+    no sense. If the whites differ, one is adapted to the other by Bradford's method.
     """
     found = _primaries(attributes)
     if found is None:
@@ -102,7 +102,7 @@ def negative_share(image: np.ndarray) -> float:
 
 
 def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
-    """(H, W, 3) multiplied by a matrix; the image itself if there is no matrix. Non-finite pixels affect no others."""
+    """Multiplies the colours of an image (H, W, 3) by a matrix, if there is one. Non-finite pixels affect no others."""
     if matrix is None:
         return image
     with np.errstate(over="ignore", invalid="ignore"):

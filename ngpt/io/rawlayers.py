@@ -20,7 +20,7 @@ LISTING = "layers.json"
 
 
 def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool = False) -> None:
-    """Writes layers (1, C, H, W) into a folder, which is made if it does not exist, and the listing last.
+    """Writes layers (1, C, H, W) into a folder, which is made if it does not exist. The listing is written last.
 
     Raises NgptError if the folder cannot be made, or if a file exists and ``overwrite`` is False.
     """

@@ -12,8 +12,8 @@
 | variances of the pixel mean (``*_var``) | mean divided by K² |
 | ``samples`` | sum |
 
-Gradients are refused, because differences between small pixels are not differences between large ones. So are motion
-vectors of unknown unit, and Cryptomatte in half floats, which has lost its ids.
+Gradients are refused, because differences between small pixels are not differences between large ones. Motion vectors
+of unknown unit are also refused, and Cryptomatte in half floats, which has lost its ids.
 """
 
 import re
@@ -112,7 +112,8 @@ def reduced(image: ExrImage, k: int, stacks: Sequence[GradientStack]) -> ExrImag
 def _reduced_part(part: ExrPart, k: int, known: dict[int, str], listed: list[str], path: str) -> ExrPart:
     """The part in large pixels.
 
-    ``known`` has the layer of the contract for the ids of channels, and ``listed`` the names of Cryptomattes.
+    ``known`` maps Python's id of a channel's array to its layer of the contract. ``listed`` has the names of
+    Cryptomattes.
     """
     window = data_window(part)
     crypto = _cryptomattes(part, listed)
@@ -217,7 +218,7 @@ _RULES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 def _cryptomattes(part: ExrPart, listed: list[str]) -> dict[str, list[str]]:
     """The name of each Cryptomatte in a part -> its channels by rank, ids and coverages alternating.
 
-    A Cryptomatte is ``listed`` in headers, or its name contains "crypto".
+    A layer is a Cryptomatte if headers list it (``listed``), or if its name contains "crypto".
     """
     found: dict[str, dict[tuple[int, int], str]] = {}
     for channel in part.channels:

@@ -2,7 +2,7 @@
 
 No file is opened here. OpenEXR calls channel ``C`` of layer ``L`` ``L.C``. Names of layers may contain dots and spaces:
 ``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer ``ViewLayer.Denoising Albedo``. A name fits a layer if it
-is the whole name of the layer or its end after a dot.
+is the whole name of the layer, or the end of that name after a dot.
 """
 
 import re
@@ -71,15 +71,16 @@ def resolve(
     ``overrides``  names of the contract -> the name of a layer in the file, whole or its end after a dot; or channels
                    with signs and factors, "-velocity.R,velocity.G". These layers are not searched by aliases
     ``path``       the name of the file for messages
-    ``writer``     the program that wrote the file, by ``writer_of``. Unless it is "ngpt", ``direct``, ``caustic`` and
-                   the other names in ``OWN`` only count beside layers that no other program writes
+    ``writer``     the program that wrote the file, as ``writer_of`` finds it. If it is not "ngpt", ``direct``,
+                   ``caustic`` and the other names in ``OWN`` count only beside layers that no other program writes
     ``origin``     in a result file, the layer that the input was read from
 
-    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part. In
-    such a file, other layers can also be called ``part.layer``. If a name fits several layers, a layer is preferred
-    whose name begins like the primal's (``Near.Combined``, ``Near.Depth``), then one with exactly this name, then one
-    in the primal's part. A layer whose name begins like that of another possible primal belongs to that image. If no
-    name of a primal is known, the only layer of colour is the primal.
+    A channel without a dot belongs to the root; in a file of several parts, it belongs to the layer named like its
+    part. In such a file, other layers can also be called ``part.layer``. If a name fits several layers, the first
+    choice is a layer whose name begins like the primal's (``Near.Combined``, ``Near.Depth``), the second is a layer
+    with exactly this name, and the third is a layer in the primal's part. A layer whose name begins like that of
+    another possible primal belongs to that other image, and is not used. If no layer has a known name of a primal, the
+    only layer of colour is the primal.
 
     Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or no
     layer fits an override.
@@ -148,8 +149,8 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
     """Guesses layers of the contract that ``found`` lacks: layer -> its name in the file.
 
     The guesses are made from names, and the user decides: ``--layer albedo="NAME"`` accepts one. Each layer of the file
-    is proposed once. Motion is proposed by its channels, as vectors to the next frame with y up, which most renderers
-    write.
+    is proposed once. Motion is proposed by its channels. Their signs are right for vectors to the next frame with y up,
+    which most renderers write.
     """
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     proposed: dict[str, str] = {}
@@ -213,7 +214,7 @@ def _group(parts: Parts) -> list[_Group]:
 
 
 def _match(alias: Alias, layer: Layer, groups: list[_Group], home: _Home, path: str) -> Found | None:
-    """The place of ``layer`` under the name of ``alias``; None if there is none. Raises NgptError for several."""
+    """The place of ``layer`` under the name of ``alias``; None if no place fits. Raises NgptError if several do."""
     complete: dict[tuple[int, tuple[str, ...]], Found] = {}
     partial: NgptError | None = None
     for group in groups:
@@ -266,7 +267,7 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
-    """The parts and names of the channels with this name, or if there are none, with a name that ends in it."""
+    """The parts and names of the channels with this name; if there are none, of the channels whose name ends in it."""
     names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
     whole = {place for place, name in names.items() if channel in (name, place[1])}
     return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}
@@ -290,7 +291,7 @@ def _features(groups: list[_Group]) -> set[tuple[int, tuple[str, ...]]]:
 
 
 def _of_other_channels(groups: list[_Group], writer: str) -> Found | None:
-    """The image of a file without R G B: luminance, one channel Y that stands for all three, or Mitsuba's X Y Z."""
+    """The image of a file without R G B: a channel Y (luminance) that stands for all three, or Mitsuba's X Y Z."""
     for name in ("primal", ""):
         for group in (group for group in groups if group.name == name):
             suffixes = group.channels.keys() & {*RGB, *XYZ, "RY", "BY"}

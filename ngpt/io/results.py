@@ -149,7 +149,7 @@ def with_result(
         if view.name:
             header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
         root, kept = suffixes, tuple(f"primal.{suffix}" for suffix in suffixes)
-        # At the end, a new part does not change the indices of the parts of other views.
+        # If a new part does not go in front, it goes to the end, where it does not change the indices of other parts.
         place = 0 if place == 0 else len(parts)
         parts.insert(place, ExrPart(name, header, {}))
     channels = parts[place].channels

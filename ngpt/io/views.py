@@ -54,7 +54,7 @@ class View(NamedTuple):
         return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
 
     def channel(self, part: int, name: str) -> str:
-        """The name in the file of a channel of this view, which need not exist."""
+        """The name that a channel of this view has in the file, or would have if it existed."""
         known = self.parts[part][1] if part < len(self.parts) else {}
         layer, dot, suffix = name.rpartition(".")
         inserted = ".".join([*([layer] if dot else []), self.infix, suffix]) if self.infix else name
@@ -73,7 +73,7 @@ def views_of(parts: Sequence[Part]) -> list[View]:
 
 
 def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[View]:
-    """The view of that name, or all views; raises NgptError if the file has no such view."""
+    """The view called ``wanted``, or all views for None. Raises NgptError if the file has no such view."""
     if wanted is None:
         return list(views)
     if found := [view for view in views if view.name == wanted]:

@@ -90,7 +90,7 @@ def _reader(file: BinaryIO) -> Callable[[BinaryIO], Form] | None:
 
 
 def _form(path: str | Path, file: BinaryIO, reader: Callable[[BinaryIO], Form]) -> Form:
-    """The description of an image that is not too large. Raises NgptError if it is, or if the file is damaged."""
+    """The description of an image. Raises NgptError if the image is too large, or if the file is damaged."""
     form = _guarded(path, lambda: reader(file))
     width, height = form.size
     if width < 1 or height < 1:

@@ -1,4 +1,4 @@
-"""Reads JPEG by Pillow, and rotates it by its orientation tag."""
+"""Reads JPEG with Pillow, and rotates the image as its orientation tag says."""
 
 from importlib.util import find_spec
 from typing import BinaryIO
@@ -20,7 +20,7 @@ def describe(file: BinaryIO) -> Form:
     from PIL import ImageOps
     from PIL.JpegImagePlugin import JpegImageFile
 
-    # Not Image.open, which limits the size: ``files`` checks it before decoding.
+    # Image.open is not used, because it limits the size: ``files`` checks the size before decoding.
     image = JpegImageFile(file)
     if image.mode not in ("L", "RGB"):
         raise Unread(f"holds {image.mode} and neither grey nor R G B; save it as R G B")

@@ -16,7 +16,7 @@ MAGIC = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
 _LONGEST = 2**16  # pixels of a side, because filters are undone in a loop over diagonals
-# x and y of the first pixel of each pass, and the steps to the next pixels
+# For each pass of an interlaced image: x and y of its first pixel, and the steps in x and y to its next pixels
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
 
 

@@ -41,7 +41,7 @@ def describe(file: BinaryIO) -> Form:
             light = light if (gain == 1.0).all() else (light / gain).astype(np.float32)
         return light[:: 1 if line[1] == b"-" else -1, :: 1 if line[3] == b"+" else -1]
 
-    # A pair of bytes of the new run lengths can hold 127 values, and one old repetition a whole image.
+    # Two bytes of the new run lengths can hold 127 values, but one old repetition can hold a whole image.
     return Form("Radiance HDR", (width, height), 3, 2**24, False, decode)
 
 
@@ -96,7 +96,7 @@ def _old_runs(pixels: np.ndarray, repeats: np.ndarray, count: int) -> np.ndarray
 def _new_runs(data: bytes, width: int, height: int) -> np.ndarray:
     """The pixels (H, W, 4) of rows that store all R, then all G, B and exponents.
 
-    The byte 128 + n means that the next byte occurs n times, and a byte n of up to 128 that n bytes follow.
+    The byte 128 + n means that the next byte occurs n times. A byte n of up to 128 means that n bytes follow.
     """
     pixels, place, begin = np.empty((height, 4, width), np.uint8), 0, bytes((2, 2, width >> 8, width & 255))
     for y in range(height):

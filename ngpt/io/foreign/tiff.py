@@ -1,4 +1,4 @@
-"""Reads the first image of a TIFF by tifffile: 8 or 16 bits count as sRGB, and floats as scene-linear."""
+"""Reads the first image of a TIFF with tifffile. Numbers of 8 or 16 bits count as sRGB, and floats as scene-linear."""
 
 import zlib
 from importlib.util import find_spec
