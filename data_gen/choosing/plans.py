@@ -1,10 +1,11 @@
 """Chooses the sampler, the number of samples and the reconstruction method by a *pilot*.
 
 The pilot consists of small renders by each sampler that could render the scene. ``plan`` is for a render whose time is
-given and whose image is made by a method. It chooses what leaves the least error. ``plan_sampler`` is for
-``--sampler auto`` if the method is not known. It compares samplers with even samples and one simple method for each
-sampler, and chooses the sampler that leaves the least error. It chooses photons where they are clearly better, but not
-in scenes whose light only photons can find. A pilot cannot notice light that none of the samplers has found.
+given and whose image is made by a method. It chooses the sampler and the method that leave the least error.
+``plan_sampler`` is for ``--sampler auto`` if the method is not known. It compares samplers with even samples and one
+simple method for each sampler, and chooses the sampler that leaves the least error. It chooses photons where they are
+clearly better, but not in scenes whose light only photons can find. A pilot cannot notice light that none of the
+samplers has found.
 """
 
 from __future__ import annotations

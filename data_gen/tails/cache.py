@@ -82,9 +82,9 @@ CELLS, _FULL = 1 << 20, 0.5
 # number is enough: a cell with few records is also read by few paths, so its noise affects only a small part of the
 # image.
 LEAST = 4
-# Paths that feed the cache read only cells with LEAST_TO_FEED records in each half. Even then, with probability RENEW,
-# they do not end there but add another record. Without this, cells that many paths read would never get more records,
-# and would keep the noise of the first ones.
+# Paths that feed the cache may end only in cells with LEAST_TO_FEED records in each half. Even in these cells, a path
+# goes on with probability RENEW, and adds another record. Without this, cells that many paths read would never get more
+# records, and would keep the noise of the first records.
 LEAST_TO_FEED, RENEW = 16, 0.25
 # Paths do not end in a *torn* cell, whose parts receive different light. A cell is torn if, along some axis, both
 # halves of its volume have _ENOUGH records, and their light differs by more than TORN times its sum and by more than
@@ -169,7 +169,7 @@ class Known:
 class Cache:
     """For each cell, the sums of light of each sort. ``known`` holds the means, which paths may read.
 
-    ``sorts`` is their number. There are two if light of the layer ``caustic`` is stored separately, and otherwise one.
+    ``sorts`` is the number of sorts: two if the light of the layer ``caustic`` is stored separately, and otherwise one.
 
     Whether a cell is trusted depends on the number of its records, and not on their light. Where light is rare, a cell
     that has found some of the light looks uncertain, and a cell that has missed the light looks certain. Trusting only
@@ -206,7 +206,7 @@ class Cache:
         if not self.unit:
             first = dr.max(dr.select(good, largest, 0))[0]
             if first > 0:
-                # A smaller number may have no inverse in float32.
+                # The exponent is at least -126, because a smaller number may have no inverse in float32.
                 self.unit = 2.0 ** max(math.ceil(math.log2(first)) - _BITS, -126)
         # The number is opaque: as a literal it would be compiled into the kernel, so every scene would need a new one.
         scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
