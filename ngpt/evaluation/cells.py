@@ -1,4 +1,4 @@
-"""Computes the cells of the tables: the result of a method for a stack, compared to the reference. Cells are cached."""
+"""Computes the cells of the tables. A cell has the errors and times of a method for one stack. Cells are cached."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from ngpt.system.writing import write_json
 # Packages whose versions change results. Without some of them, rows are absent.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
-# The version of the format of cached cells. Since version 2, they have times by both clocks.
+# The version of the format of cached cells. Since version 2, cells have times by both clocks, wall and processor.
 _FORMAT = 2
 
 
@@ -51,7 +51,7 @@ class Scorer:
     ) -> dict[str, Any]:
         """The entries of a cell: ``metrics``, ``reconstruct`` with the seconds by clock, and ``absent``, which is None.
 
-        If the method fails, the only entry is ``absent``, the reason. ``key`` identifies the stack in the cache.
+        If the method fails, the only entry is ``absent``, with the reason. ``key`` identifies the stack in the cache.
         ``stack`` is called only if the cell is not in the cache. The result is written to the file ``image`` unless
         that is None.
         """

@@ -173,7 +173,7 @@ class EvaluationConfig:
         return [Column(n, name, method, s, self.render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
 
     def render(self, kind: str, sampler: str) -> Render:
-        """The stacks of this ``kind`` by the sampler that the configuration calls ``sampler``.
+        """The render of stacks of this ``kind`` by the sampler that the configuration calls ``sampler``.
 
         Only the default sampler of images can leave features out. With another sampler, the kind "path" becomes
         "features". Raises NgptError for options that the sampler does not have.
@@ -226,7 +226,7 @@ def file_part(column: str) -> str:
 
 
 def scene_name(scene: str) -> str:
-    """The name of a scene in tables. For a file, it is the folder's name, and the part of the file's after "scene"."""
+    """The name of a scene in tables. For a file, it is its folder's name, and what follows "scene" in its own name."""
     path = Path(scene)
     return f"{path.parent.name}{path.stem.removeprefix('scene')}" if path.suffix == ".xml" else path.name
 
@@ -234,9 +234,9 @@ def scene_name(scene: str) -> str:
 def read_config(path: str | Path) -> EvaluationConfig:
     """Reads a TOML file. Raises NgptError for unknown entries, and for values of a wrong type.
 
-    The entry ``base`` names another file, relative to the folder of this one, from which missing entries are taken. If
-    ``samplers`` are tables of options, those with gradients are compared, except for samplers that a variant names.
-    ``rivals``, ``clock`` and other entries may name the samplers without gradients.
+    The entry ``base`` names another file, relative to the folder of this file. Missing entries are taken from that
+    file. If ``samplers`` are tables of options, the samplers with gradients among them are compared, except for those
+    that a variant names. ``rivals``, ``clock`` and other entries may name the samplers without gradients.
     """
     values = _with_base(Path(path))
     if isinstance(tables := values.get("samplers"), dict):

@@ -40,7 +40,7 @@ class Reference:
 
     @cached_property
     def mean(self) -> np.ndarray:
-        """The reference as one image, (H, W, 3): r, or m = (a + b) / 2."""
+        """The reference as one image (H, W, 3): the image itself, or the mean (a + b) / 2 of the halves a and b."""
         return middle(self.images)
 
     @property
@@ -56,7 +56,7 @@ class Reference:
 
     @property
     def noise(self) -> float | None:
-        """The relMSE of the mean image by its own noise; None if the files hold no variances."""
+        """The relMSE that the noise of the mean image causes; None if the files hold no variances."""
         if not all("primal_var" in stack for stack in self.stacks):
             return None
         if len(self.stacks) == 1:
@@ -69,9 +69,9 @@ class Reference:
         """The relMSE below which the order of methods is not reliable; None if the files hold no variances.
 
         With one image, it is three times the noise of the image, which is part of every error. With two halves, it is
-        three standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with t the truth: in each pixel the product
-        has the expectation 0, and its variance is the product of the variances of a and b. The noise of the channels is
-        taken to be the same.
+        three standard errors of the mean of (a - t)(b - t) / (m² + 1e-3), with a and b the halves, m their mean and t
+        the truth: in each pixel the product has the expectation 0, and its variance is the product of the variances of
+        a and b. The noise of the three channels of a pixel is taken to be fully correlated.
         """
         noise = self.noise
         if noise is None or len(self.stacks) == 1:

@@ -1,4 +1,4 @@
-"""Kinds of stacks, by samplers: the inputs of methods."""
+"""The stacks that methods read: each is of one kind, and rendered by one sampler."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,9 +12,9 @@ KINDS = {"gradients": "auto", "features": "primal", "path": "primal"}
 
 @dataclass(frozen=True)
 class Render:
-    """A kind of stack by a sampler. ``given`` has its options that are not defaults: "radius=1, subpixels=2".
+    """A kind of stack, rendered by a sampler. ``given`` has options that are not defaults: "radius=1, subpixels=2".
 
-    ``name`` is its name in files, costs and results.
+    ``name`` is the name of the render in files, costs and results.
     """
 
     kind: str
@@ -27,7 +27,7 @@ class Render:
 
     @property
     def by(self) -> str:
-        """Sampler and options; "" if they are the usual ones of the kind."""
+        """The sampler and its options; "" if they are the usual ones of the kind."""
         usual = self.sampler == KINDS[self.kind] and not self.given
         return "" if usual else " ".join([self.sampler, *filter(None, self.given.split(", "))])
 

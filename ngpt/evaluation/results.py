@@ -26,9 +26,10 @@ def shared_scenes(results: dict[str, Any]) -> list[str]:
 def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
     """A row for each scene, spp and method: median and quartiles over seeds; then means over scenes, with scene None.
 
-    ``error`` is the median of the primary metric. Only methods that have all scenes have means. They are geometric, but
-    arithmetic for metrics that are no errors (PSNR, SSIM). An error below 0 has no geometric mean; the halves of the
-    reference cannot distinguish it from 0. ``pareto`` says that no other row of the scene is faster and better.
+    ``error`` is the median of the primary metric. A method has means only if it has results for all scenes. Means of
+    errors are geometric; means of metrics that are no errors (PSNR, SSIM) are arithmetic. An error below 0 has no
+    geometric mean: the halves of the reference cannot distinguish such an error from 0. ``pareto`` says that no other
+    row of the scene is ahead in time and error (``_is_ahead``).
     """
     rows: list[dict[str, Any]] = []
     groups: dict[tuple, list[dict[str, Any]]] = {}

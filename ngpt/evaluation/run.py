@@ -32,9 +32,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Fills the folder ``out``, and returns the contents of its results.json. ``renderer`` renders missing stacks.
 
-    Cells in the cache (by default ``out``/cache) are not computed again, so an interrupted run can be continued. Rows
-    of scenes and methods that lack something say so. Raises NgptError for scenes, references and samplers that do not
-    exist, before anything is rendered.
+    Cells in the cache (by default ``out``/cache) are not computed again, so an interrupted run can be continued. If a
+    scene or a method lacks something, its rows say what. Raises NgptError for scenes, references and samplers that do
+    not exist, before anything is rendered.
     """
     scenes = config.scene_files()
     check_named(config, scenes, renderer)
@@ -95,7 +95,7 @@ def evaluate(
                     for spp, seed, here in config.places()
                     for column in here
                 ]
-            # After each scene, so that the results of a long run can be looked at.
+            # Results are written after each scene, so that they can be looked at during a long run.
             write_results(results, out)
             # Kernels contain code for the objects of all scenes in memory, so finished scenes are removed.
             gc.collect()
@@ -141,7 +141,8 @@ def _scene(
     pilot = _pilot([render for n, render in renders.items() if not lacks[n]])
     first = stacks.stack(pilot, stacks.samples(pilot, config.spp[0], costs), 0)
     if stacks.given or name in config.references:
-        # Not for our own stacks, where fireflies of few samples could look like another exposure.
+        # Stacks that were rendered here are not checked, because fireflies of few samples could look like another
+        # exposure.
         reference.check(first)
     entry: dict[str, Any] = {"file": stacks.source, "size": [first.width, first.height], "cost": costs}
     entry["exposure"] = auto_exposure(reference.mean)
@@ -177,7 +178,7 @@ def _scene(
                     "absent": None,
                 }
             )
-    # All at once, so that a scene that fails half-way is absent as a whole.
+    # The cells are added all at once, so that a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
 
@@ -202,7 +203,7 @@ def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) ->
 
 
 def _pilot(renders: list[Render]) -> Render:
-    """The render that size and exposure of a scene are taken from: the usual one, unless all columns have others."""
+    """The render that shows size and exposure of a scene: the usual one, unless all gradient columns have others."""
     gradients = [render for render in renders if render.kind == USUAL.kind]
     return gradients[0] if gradients and USUAL not in gradients else USUAL
 

@@ -1,4 +1,4 @@
-"""Stacks, references and costs of a scene, which are rendered once and then taken from the cache.
+"""Stacks, references and costs (seconds per sample) of a scene, which are rendered once and then taken from the cache.
 
 The cache has folders NAME-HASH for each scene. The hash depends on the contents of the scene's files, the size, the
 version of Mitsuba, and the code of the sampler. A folder holds
@@ -69,7 +69,7 @@ class SceneStacks:
             self._parts = [scene, list(config.size), __version__, version("mitsuba")]
 
     def key(self, sampler: str) -> str:
-        """A hash of all that images by a sampler depend on."""
+        """A hash of everything that the images of a sampler depend on."""
         if sampler not in self._keys:
             parts = json.dumps([*self._parts, self.renderer.code(sampler)])
             self._keys[sampler] = hashlib.sha256(parts.encode()).hexdigest()
@@ -81,10 +81,9 @@ class SceneStacks:
         return self.cache / f"{self.name}-{self.key(sampler)[:12]}"
 
     def reference(self) -> Reference:
-        """The reference in the configuration, or in the folder; otherwise two halves, each rendered with half the
-        budget.
+        """The reference from the configuration, from a user's folder, or rendered here.
 
-        Raises NgptError if a folder has none.
+        Rendering makes two halves, each with half of the budget. Raises NgptError if a folder has no reference.
         """
         config = self.config
         if self.name in config.references:
@@ -107,11 +106,12 @@ class SceneStacks:
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
-        """Name -> seconds per sample of the whole image, for the usual renders, the clock and ``renders``.
+        """The cost of each render, by name, for the usual renders, the ``clock`` and ``renders``.
 
-        There are ``median`` and quartiles ``low`` and ``high`` over renders in turn, with compiled kernels, and the
-        ``sampler`` that rendered. Costs that are not in the cache are measured in turn with the clock, and scaled to
-        the cached cost of the clock. Empty for a user's folder of stacks.
+        A cost has seconds per sample of the whole image, without the compilation of kernels: ``median`` and quartiles
+        ``low`` and ``high`` over several renders. It also has the ``sampler`` that rendered. Costs that are not in the
+        cache are measured in alternation with the clock, and scaled to the cached cost of the clock. The result is
+        empty for a user's folder of stacks.
         """
         if self.given:
             return {}
@@ -151,7 +151,7 @@ class SceneStacks:
 
     @property
     def clock(self) -> Render:
-        """The render whose samples the nominal numbers count."""
+        """The render whose samples per pixel are the nominal ones, ``spp`` in the configuration."""
         return self.resolve(self.config.render(USUAL.kind, self.config.clock))
 
     def resolve(self, render: Render) -> Render:
@@ -179,7 +179,7 @@ class SceneStacks:
         return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)
 
     def stack_key(self, render: Render, spp: int, seed: int) -> list:
-        """The key of a stack in the cache of cells, which does not need its render."""
+        """The key of a stack in the cache of cells. The stack need not be rendered for it."""
         if not self.given:
             return [self.key(render.sampler), render.name, spp, seed]
         path = self._path(render, spp, seed)

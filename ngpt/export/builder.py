@@ -123,7 +123,8 @@ class Graph:
     def body(self, make: Callable[..., Sequence[Value]], inputs: Mapping[str, tuple], shapes: Sequence[tuple]) -> Any:
         """A graph inside the graph, which may read all values that were made before.
 
-        ``make`` is called with its inputs, and returns its outputs. ``inputs`` and ``shapes`` have their (type, shape).
+        ``make`` is called with the inputs of the inner graph, and returns its outputs. ``inputs`` has the (type, shape)
+        of each input, and ``shapes`` that of each output.
         """
         given = [self._new(name) for name in inputs]
         self._bodies.append([])
@@ -179,7 +180,7 @@ def choose(condition: Value, then: Callable[[], Value], otherwise: Callable[[], 
 
 
 def repeat(most: int, step: Callable[[Value, Value], tuple[Value, Value | bool]], state: Value, shape: Shape) -> Value:
-    """The float32 ``state`` after at most this number of steps.
+    """The float32 ``state`` after at most ``most`` steps.
 
     ``step`` takes the number of the step, from 0, and the state; it returns the next state, and whether to go on.
     """

@@ -27,10 +27,11 @@ from ngpt.version import __version__
 
 
 def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
-    """The graph of the weights in a file; ``name`` is its name in the metadata.
+    """The ONNX graph for the weights in a file. ``name`` is the name of the method in the metadata.
 
     ``precision`` is the precision of all convolutions except for the last; everything else is always float32. float16
-    is for GPUs: on CPUs, ONNX Runtime computes in float32, with conversions, which hides overflows and takes longer.
+    is for GPUs. On CPUs, ONNX Runtime computes in float32 and converts before and after, which takes longer and hides
+    overflows.
 
     Raises NgptError for weights that cannot be read, and for networks whose base has no graph.
     """
@@ -80,10 +81,11 @@ def _base_reach(model: Reconstructor) -> int:
 def bytes_per_pixel(model: Reconstructor) -> int:
     """An upper bound of the bytes that a run needs for each pixel, in addition to the image's layers.
 
-    tests/network/test_run_onnx.py measures it. The last convolution reads the longest list of tensors. They are in
-    memory as the list, as one tensor, and about once more. The channels are in memory six times, from raw layers to one
-    tensor. The head holds the prediction in three forms. The arena of ONNX Runtime allocates more than that, most of
-    all if sizes are halved and doubled without weights. ngpt-combine took 0.6 of its bound at 1280x720.
+    tests/network/test_run_onnx.py measures it. The last convolution reads the longest list of tensors. These tensors
+    are in memory three times: as the list, joined to one tensor, and about once more. The channels are in memory six
+    times, from raw layers to one tensor. The head holds the prediction in three forms. The arena of ONNX Runtime
+    allocates more than that, most of all if sizes are halved and doubled without weights. ngpt-combine took 0.6 of its
+    bound at 1280x720.
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)
@@ -131,15 +133,15 @@ def convolutions(
     """The graph of a network of ``ngpt.network.unet``, with the input ``given`` and the output ``made``."""
     for module in network.modules():
         if isinstance(module, Convolution):
-            # Normalised once, and not in each run of the graph.
+            # Weights are normalised once, here, and not in each run of the graph.
             weight = module.weight().detach()
             if precision == "float16" and module is not network.head.convolution:  # type: ignore[union-attr]
                 weight = weight.half()
             module.weight = partial(_same, weight)  # type: ignore[method-assign]
-    # No size is 0 or 1, which the exporter would take for constants.
+    # No size is 0 or 1, because the exporter would take such a size for a constant.
     example = torch.zeros(2, inputs, 5 * alignment, 7 * alignment)
     tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
-    # Otherwise the exporter would report that torchvision is not installed, which it does not need.
+    # Without this, the exporter would report that torchvision is not installed, although it does not need torchvision.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

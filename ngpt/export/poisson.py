@@ -2,7 +2,7 @@
 
 The cosine transforms are matrix products. The graph makes the matrices from the size of its input, so one file serves
 every size. They cost O(H W (H + W)) in place of the O(H W log(H W)) of a fast transform. But matrix products run near
-the peak speed of a machine: up to 1920x1080 both take the same time on two CPU cores (docs/lab/log).
+the peak speed of a machine: up to 1920x1080, both ways take the same time on two CPU cores (docs/lab/log).
 """
 
 import math

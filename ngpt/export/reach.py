@@ -1,9 +1,10 @@
 """Measures the overlap that the tiles of a network need.
 
-``Reconstructor.radius`` is the distance from which a pixel can influence another. For networks with kernels or sweeps
-at several resolutions, it can be twice the distance that makes any difference: the farthest light passes through every
-convolution, every coarse pixel and every sweep, each time with a small weight. Tiles that overlap by the whole radius
-need four times the memory. So the distance that matters is measured, with noise that is stronger than in images.
+``Reconstructor.radius`` is the distance up to which a pixel can influence another pixel. For networks with kernels or
+sweeps at several resolutions, this radius can be twice the distance up to which the influence matters: light from the
+greatest distance passes through every convolution, every coarse pixel and every sweep, each time with a small weight.
+Tiles that overlap by the whole radius need four times the memory. So the distance that matters is measured, on examples
+with stronger noise than images have.
 """
 
 import numpy as np
@@ -18,15 +19,16 @@ from ngpt.network.model import Reconstructor
 TOLERANCE = 1e-6
 # The number of examples, and the side of the square in the middle of an example that is compared.
 EXAMPLES, MIDDLE = 3, 64
-# Pixels that are added to the distance that the examples need, because images differ; and the radius up to which
-# nothing is measured.
+# BESIDE pixels are added to the distance that the examples need, because images differ from the examples. Nothing is
+# measured for networks with a radius up to NEAR.
 BESIDE, NEAR = 24, 48
 
 
 def reach(model: Reconstructor) -> int:
     """The overlap in pixels, a multiple of the alignment: ``radius`` rounded up, or less if that is enough.
 
-    It is enough if every pixel of all examples is within ``TOLERANCE``. ``BESIDE`` is added to the least such distance.
+    An overlap is enough for the examples if no pixel of their results differs by more than ``TOLERANCE`` from the
+    result with the whole radius. ``BESIDE`` is added to the least overlap that is enough for them.
     """
     step = model.alignment
     whole = -(-model.radius // step)
@@ -64,7 +66,7 @@ def _least(model: Reconstructor, whole: int, seed: int) -> int:
 
 
 def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
-    """Layers (1, C, side, side): rectangles of all brightnesses with noise, a hundred times stronger in 1 %."""
+    """Layers (1, C, side, side): rectangles of all brightnesses with noise, 100 times stronger in 1 % of the pixels."""
     rng = np.random.default_rng(seed)
     image = np.ones((3, side, side))
     for _ in range(side):

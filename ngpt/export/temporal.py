@@ -12,7 +12,7 @@ from ngpt.version import __version__
 
 
 def temporal_model(weights: str | Path) -> onnx.ModelProto:
-    """The graph for weights of such a network. Raises NgptError for other weights."""
+    """The graph for the weights in a file. Raises NgptError if they are not of a network that blends frames."""
     model, header = load(weights)
     proto = convolutions(model, len(INPUTS), model.alignment, "inputs", "corrections")
     proto.producer_name, proto.producer_version = "ngpt", __version__

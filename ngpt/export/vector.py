@@ -22,7 +22,7 @@ def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) 
 
 
 def quiet() -> Any:
-    """Options without warnings that inputs have defaults."""
+    """Options that suppress the warnings that inputs have defaults."""
     options = runtime().SessionOptions()
     options.log_severity_level = 3
     return options

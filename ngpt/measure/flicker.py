@@ -1,4 +1,4 @@
-"""Flicker: the change of a shot's error from frame to frame."""
+"""Flicker: how the error of a shot (a frame sequence) changes from frame to frame."""
 
 from collections.abc import Sequence
 

@@ -30,8 +30,8 @@ def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
 def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
     """(first, last, number) of HDR-FLIP's exposures in stops, which depend only on the reference.
 
-    At the first exposure the ACES curve maps the brightest luminance to 0.85, and at the last one the median luminance;
-    there is one exposure for each stop [section 4.3].
+    At the first exposure, the ACES curve maps the brightest luminance to 0.85. At the last exposure, it maps the median
+    luminance to 0.85. There is one exposure for each stop between them [section 4.3].
     """
     luminance = np.maximum(reference, 0).astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     lit = luminance[luminance > 0]

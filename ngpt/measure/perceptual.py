@@ -42,11 +42,11 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def elpips(image: np.ndarray, reference: np.ndarray, backbone: str = "", weights: str = "") -> float:
-    """E-LPIPS by SqueezeNet, 0 for equal images; ``backbone`` and ``weights`` are files that docs/train/losses.md
-    explains.
+    """E-LPIPS by SqueezeNet, 0 for equal images.
 
-    The distance d(x, r) of sRGB(x / (1 + mean_c x)), averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"].
-    All images get the same transforms. Raises NgptError for files that are missing or have the wrong contents.
+    It is the distance d(x, r) of sRGB(x / (1 + mean_c x)), averaged over random transforms [Kettunen et al. 2019,
+    "E-LPIPS"]. All images get the same transforms. docs/train/losses.md explains the files ``backbone`` and
+    ``weights``. Raises NgptError for files that are missing or have the wrong contents.
     """
     return _elpips(backbone, weights)(image, reference)
 

@@ -1,1 +1,1 @@
-"""The parts of an ONNX file around the network. Each module repeats a module of the same name as a graph."""
+"""Graphs for the parts of an ONNX file around the network. Each module repeats the module that its docstring names."""

@@ -15,7 +15,7 @@ _NEVER = 3e38
 def wcv(
     primal: Value, dx: Value, dy: Value, trusted: tuple[Value, Value], variance: tuple[Value, ...], mean: Value
 ) -> Value:
-    """The base (N, 3, H, W) of finite layers.
+    """The base (N, 3, H, W), computed from finite layers.
 
     ``trusted``   (N, 1, H, W) for dx and dy, true where they can be trusted
     ``variance``  of primal, dx and dy, as the renderer writes them

@@ -11,7 +11,7 @@ STATISTICS = ("exposure", "largest depth", "least radiance", "largest radiance",
 
 
 def statistics(clean: Mapping[str, Value], variance_layers: tuple[Value, ...] | None) -> Value:
-    """The (5) values of ``STATISTICS``, for finite layers; 0 for values without their layers.
+    """The (5) values of ``STATISTICS``, from finite layers; 0 for values whose layers are missing.
 
     ``variance_layers`` are the variances of primal, dx and dy; None for networks whose graph makes no base.
     """

@@ -5,7 +5,7 @@
             -> image
 
 All of it is float32, whatever the precision of the network. Inputs and output include directly visible emission, and
-the light that gradients exclude. The latter is denoised by another denoiser, or else by a diffusion.
+the light that gradients exclude (``caustic``). This light is denoised by another denoiser, or else by a diffusion.
 """
 
 import numpy as np
@@ -25,12 +25,12 @@ from ngpt.network.model import DARK, HUGE, WINDOW
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
 # Light that gradients exclude, and its variance.
 _APART = ("caustic", "caustic_var")
-# Another denoiser's image of this light, which is also a part of its image of the primal.
+# Another denoiser's image of ``caustic``. The same light is also a part of that denoiser's image of the primal.
 _FOUND = "denoised_caustic"
 
 
 class _OperatorsOfHeads(Operators):
-    """Operators with ``signed_log`` and ``signed_exp``. The inverse of a logarithm that was made here adds no nodes."""
+    """Operators with ``signed_log`` and ``signed_exp``. ``signed_exp`` of a result of ``signed_log`` adds no nodes."""
 
     def __init__(self) -> None:
         self._images: dict[str, Value] = {}
@@ -45,7 +45,7 @@ class _OperatorsOfHeads(Operators):
 
 
 def layers(config: ModelConfig) -> tuple[str, ...]:
-    """The inputs of the graph of such a model, in order."""
+    """The inputs of the graph for a model of this configuration, in order."""
     needed = ("direct", *config.needs, *config.layers)
     if by_denoiser(config):
         needed += ("caustic", _FOUND)
@@ -65,7 +65,7 @@ def by_denoiser(config: ModelConfig) -> bool:
 
 
 def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto) -> Graph:
-    """The graph around a network of that configuration, ``channels`` to ``prediction``."""
+    """The whole graph for a configuration; ``network`` is the network alone, from ``channels`` to ``prediction``."""
     graph = Graph("reconstruction")
     raw = _buffers(graph, layers(config))
     data = _repaired(raw, config)
@@ -82,7 +82,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
 
     mirror = Mirror(raw["primal"], alignment)
     completed = features.completed(scaled, config.inputs)
-    # The logarithm keeps signs, so padding may come after it.
+    # Encoding keeps signs, so padding, which flips some signs, may come after it.
     padded = [mirror.pad(features.encoded(name, completed[name]), name) for name in config.inputs]
     prediction = graph.include(network, "network/", op.Concat(*padded, axis=1))
 

@@ -24,7 +24,7 @@ class PaddedAxis:
     step: Value
 
     def borders(self, values: Value, more: int) -> tuple[Value, Value]:
-        """The entries of ``values`` before the image; and those after it, and for its last ``more`` pixels."""
+        """The entries of ``values`` before the image; and those for its last ``more`` pixels and after the image."""
         last = op.Reshape(self.size + (MARGIN - more), [1])
         return op.Slice(values, [0], [MARGIN], [0]), op.Slice(values, last, [END], [0])
 
@@ -62,7 +62,7 @@ def _pixels(layer: Value, side: PaddedAxis) -> Value:
 
 
 def _differences(layer: Value, side: PaddedAxis, signed: bool) -> Value:
-    """``_pixels`` for differences along that axis. The last one leads out of the image, so the border replaces it."""
+    """``_pixels`` for differences along that axis. The border replaces the last one, which leads out of the image."""
     steps = [
         op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
         for step in side.borders(side.step, 1)

@@ -40,9 +40,9 @@ def clean(x: Value) -> Value:
 
 
 def repaired(raw: Mapping[str, Value], gradients: bool) -> RepairedInputs:
-    """The ``raw`` layers of a renderer, with ``primal`` and ``direct``, repaired as by ``ngpt.repair``.
+    """The ``raw`` layers of a renderer, with ``primal`` and ``direct``, repaired as ``ngpt.repair`` does.
 
-    ``gradients``  whether the network reads gradients. Then it works on light without ``caustic``
+    ``gradients``  whether the network reads gradients. If so, its light excludes ``caustic``
     """
     light = raw["primal"] - raw["direct"]
     rest = light - raw["caustic"] if "caustic" in raw else light
@@ -108,7 +108,7 @@ def _filled(light: Value, good: Value) -> Value:
 
 
 def _mean(sums: Value, otherwise: Value | float) -> Value:
-    """Sums of RGB over counts (N, 4, H, W) as means, ``otherwise`` where nothing was counted."""
+    """Means of RGB from sums of RGB and a count, (N, 4, H, W); ``otherwise`` where the count is 0."""
     total, count = op.Slice(sums, [0], [3], [1]), op.Slice(sums, [3], [4], [1])
     there = op.Greater(count, 0.0)
     return op.Where(there, total / op.Where(there, count, 1.0), otherwise)

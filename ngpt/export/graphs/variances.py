@@ -7,10 +7,11 @@ from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """Variances, averaged twice over 3x3 known values; and ``inside``.
+    """Variances (N, 3, H, W), averaged twice over 3x3 values; and the result of ``inside``.
 
-    Without known values, the result is the mean of all values. For differences it is the fourth power of the mean of
-    fourth roots, times ``TYPICAL``; larger values do not change.
+    Only known values are averaged. Where none is known nearby, the result is the mean of all known values of the image.
+    For differences, the average is the fourth power of the mean of fourth roots, times ``TYPICAL``; a variance that is
+    larger than this average does not change.
     """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
@@ -24,7 +25,7 @@ def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> 
     mean = v / op.Max(n, FEW)
     roots = channels(mean, 1, 3)
     robust = op.Max(op.Mul(roots * roots, roots * roots) * float(TYPICAL), channels(values, 1, 3))
-    # Without rounding, a count would be at least a ninth of a ninth.
+    # A count is 0 or at least 1/81 (a ninth of a ninth), apart from rounding.
     return op.Where(op.Greater(n, 1e-3), op.Concat(channels(mean, 0, 1), robust, axis=1), typical), there
 
 

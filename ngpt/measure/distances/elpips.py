@@ -2,9 +2,10 @@
 
     d(a, b) = Σ_l  mean over pixels  Σ_c  w_lc (f_lc(a) / |f_l(a)| - f_lc(b) / |f_l(b)|)²
 
-[Zhang et al. 2018, "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", eq. 1; Kettunen et al.
-2019, "E-LPIPS"]. The weights w are fitted to people's judgements. They are those of E-LPIPS and must be given, because
-other weights would make another metric.
+f_l are the features of layer l of a network, and c are their channels [Zhang et al. 2018, "The Unreasonable
+Effectiveness of Deep Features as a Perceptual Metric", eq. 1; Kettunen et al. 2019, "E-LPIPS"]. The weights w are
+fitted to people's judgements. They are those of E-LPIPS and must be given, because other weights would make another
+metric.
 """
 
 from pathlib import Path

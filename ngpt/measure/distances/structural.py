@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-# From Wang et al. 2003, for scales 1 to 5. Without scales that are too coarse for the image, the rest is scaled to sum
-# 1.
+# The weights of scales 1 to 5, from Wang et al. 2003. Scales that are too coarse for an image are left out, and the
+# other weights are then scaled so that their sum is 1.
 _WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 # The windows of SSIM are boxes at every third pixel. The random offsets of the ensemble cover the positions between.
 _WINDOW, _STRIDE = 7, 3
