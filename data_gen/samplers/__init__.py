@@ -1,6 +1,6 @@
 """The samplers: one registry, one way to call them.
 
-A new sampler is a class and one entry. The entry is in the ``about`` of the sampler's family, which a line here
+A new sampler is a class and one entry. The entry is in the module ``about`` of the sampler's package, which a line here
 imports. The command line, ``ngpt info``, the choice of "auto", the refusals, the configurations, the evaluation, the
 docs and the tests read the entries. Reading them does not import Mitsuba.
 """

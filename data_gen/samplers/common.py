@@ -33,11 +33,11 @@ from ngpt.options import written
 
 
 def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
-    """Whether the integrator is ``path`` in a scene where that is biased.
+    """Whether the integrator is Mitsuba's ``path``, and ``path`` is biased in this scene.
 
-    ``path`` returns 0 for a path that escapes after passing only holes, and drops the light that emitter sampling found
-    at partly opaque masks. Scenes with an environment are not affected. ``path`` also never finds light that lamps
-    without size send through holes.
+    Holes are surfaces that let a share of the light go straight through. ``path`` returns 0 for a path that escapes
+    after passing only holes, and drops the light that emitter sampling found at partly opaque masks. Scenes with an
+    environment are not affected by this. ``path`` also never finds light that lamps without size send through holes.
     """
     if integrator.class_name() != "PathIntegrator":
         return False
@@ -57,7 +57,7 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
 def recorded(
     scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
 ) -> SamplePass:
-    """A pass that puts the results of ``samples`` on the film. ``samples`` is recorded once: see ``Frozen``.
+    """Returns a pass that puts the results of ``samples`` on the film. ``samples`` is recorded once: see ``Frozen``.
 
     Besides the camera rays, ``samples`` may use rays displaced by the ``shifts``.
     """
@@ -81,17 +81,17 @@ class GradientIntegrator(mi.SamplingIntegrator):
         # The name of the sampler. Its ``entry`` in the registry has the options and the refusals
         self.name = by_plugin(props.plugin_name()).name
         self.options = self.entry.settings({name: props[name] for name in self.entry.options if name in props})
-        # Whether the user has set this option. If not, ``share_tails`` sets it for each render
+        # Whether the user has set the option ``tails``. If not, ``share_tails`` sets the option for each render
         self.given_tails = "tails" in self.entry.options and "tails" in props
         # Whether the film counts failed shifts, if the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
         if not self.nested:
             self.limits = Limits.read(props)
         self.channels: list[str] = []
-        # Chooses lamps, if the sampler can choose them by place and the scene has many
+        # Chooses lamps, if the sampler can choose lamps by place and the scene has many lamps
         self.places: Places | None = None
 
-    # A property: Dr.Jit traverses all attributes if an integrator is among the variables of a loop.
+    # Not an attribute, because Dr.Jit traverses all attributes if an integrator is among the variables of a loop.
     @property
     def entry(self) -> Sampler:
         return SAMPLERS[self.name]
@@ -118,7 +118,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return mi.load_dict({"type": self.follows, **self.limits.parameters()})
 
     def facts(self, scene: mi.Scene, sensor: mi.Sensor) -> Facts:
-        """The facts about the scene if this integrator renders it instead of the scene's own."""
+        """The facts about the scene if this integrator renders it instead of the scene's own integrator."""
         return scene_facts(scene, sensor, self.reference())
 
     def prepare(self, scene: mi.Scene, sensor: mi.Sensor | None = None) -> SamplePass:
@@ -135,7 +135,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         raise NotImplementedError
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """Only the primal estimate, as the ``reference()`` computes it."""
+        """Returns only the primal estimate, as the ``reference()`` computes it."""
         return self.reference().sample(scene, sampler, ray, medium, active)
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
@@ -151,7 +151,9 @@ class GradientIntegrator(mi.SamplingIntegrator):
             return render_passes(self.prepare(scene, sensor), sensor, seed, budget, **limits)
 
     def share_tails(self, scene: mi.Scene, sensor: mi.Sensor, budget: Budget) -> Budget:
-        """Decides whether paths share their tails, if the user has not; returns the remaining budget."""
+        """Decides whether paths share their tails (may end in a cache of light that other paths have found), if the
+        user has not decided it. Returns the budget that remains beside the cache.
+        """
         if "tails" not in self.options:
             return budget
         found = sharing_of(sensor, self.entry, self.facts(scene, sensor), self.options, budget)
@@ -189,7 +191,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
     def first_surface(self, scene, media: Media, ray, medium, active) -> mi.PreliminaryIntersection3f:
         """``first_hit()`` of a piece of a camera ray. As in ``volpath``, hidden lamps block rays inside a medium."""
         # Where a boundary coincides with a surface, coherent rays meet the boundary half as often as other rays do.
-        # Rays of ``volpath`` are never coherent.
+        # Rays of ``volpath`` are never coherent, so in scenes with boundaries these rays are not coherent either.
         coherent = not media.boundaries
         hit = self.first_hit(scene, ray, active, coherent=coherent)
         if self.hide_emitters:
@@ -217,11 +219,12 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return T * si.emitter(scene).eval(si, hit.is_valid() if media.grids else mi.Bool(True))
 
     def behind_grids(self, scene, media: Media, segment: segments.Segment) -> mi.Spectrum:
-        """Le at the end of the first ``segment`` of a path, if it crosses grids, or escapes in a scene with grids.
+        """Returns Le at the end of the first ``segment`` of a path, if the segment crosses grids (media of varying
+        density), or if it escapes in a scene with grids.
 
-        This light is not in ``direct``, since it has noise. The noise is less in the sum with light that was scattered
-        on the way, since a path finds one or the other. The environment is included here in all pixels; otherwise the
-        box around a cloud would stand out from the sky.
+        This light is not in ``direct``, since it has noise. A path finds either this light or light that was scattered
+        on the way, so the sum of both has less noise. The environment is included here in all pixels: if it were
+        included only behind grids, the box around a cloud would stand out from the sky.
         """
         if not self.limits.shows or not media.grids:
             return mi.Spectrum(0)

@@ -58,13 +58,13 @@ class Entry:
     # module, the function itself may be given
     module: str | Callable[..., Any]
     standing: str = field(default="niche", kw_only=True)  # one of ``STANDINGS``: order in the help, tests
-    # All of them are given to ``make``, except the options in ``COMMON``.
+    # The options by name. ``make`` gets all of them, except the options in ``COMMON``.
     options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
-    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)  # the first one with a reason counts
+    refusals: tuple[Rule, ...] = field(default=(), kw_only=True)  # the first rule that gives a reason counts
     # Notes for the user by subject: "transport" and "noise"; "mirrors" and "media", shown if a scene has them
     notes: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     loses: str = field(default="", kw_only=True)  # which light of lamps without size is lost at holes; "": none
-    # Whether it uses Mitsuba's densities for lamps, which are wrong for bent lamps (``BentLamps``)
+    # Whether it uses Mitsuba's densities for lamps; these are wrong for bent lamps (``BentLamps``)
     leaves_lamps: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -118,16 +118,16 @@ class Sampler(Entry):
     _: KW_ONLY
     gradients: bool = True  # whether it renders dx and dy
     rank: int = 0  # "auto" takes the sampler of least rank that can render the scene; 0: never
-    # Whether the pilot of "auto" compares it with others in scenes that it can render. This is set if measurements have
-    # shown that the pilot chooses the sampler in the scenes where it is best (``data_gen.choosing.plans``)
+    # Whether the pilot of "auto" (small test renders) tries this sampler in scenes that it can render. This is set if
+    # measurements have shown that the pilot chooses the sampler where it is best (``data_gen.choosing.plans``)
     tried: bool = False
     compiles: float = 2.0  # seconds that a core takes to compile its kernels; used if ``tried``
     # Kinds of light that it finds, and that paths from the camera hardly find: "caustics" (seen in mirrors or through
     # glass), "hidden lamps" (whose light comes indirectly), "grids" (light in media of varying density, by photons)
     finds: tuple[str, ...] = ()
     diagnoses: bool = False  # whether it counts failed shifts (--diagnostics): ``make`` takes ``diagnostics=True``
-    # 0 if all samples are independent. Otherwise samples of a pass depend on each other or splat: this is the number of
-    # samples per pixel in a pass, and variances are computed over passes
+    # 0 if all samples are independent. If samples of a pass depend on each other, or add light to other pixels (splat),
+    # this is the number of samples per pixel in a pass, and variances are computed over passes
     batch: int = 0
     together: bool = False  # whether pixels share paths: a pass needs all pixels, with equally many samples
     lane_bytes: int = LANE_BYTES  # memory of a lane, which is one sample of one pixel, in a pass
@@ -156,7 +156,7 @@ class Sampler(Entry):
 
     @property
     def film_of_gradients(self) -> bool:
-        """Whether its film may need room for more than colour and features. Studies may put any layer."""
+        """Whether its film may need room for more than colour and features. A study may put any layer on its film."""
         return self.gradients or bool(self.batch) or self.standing == "study"
 
     @property
@@ -184,19 +184,21 @@ class Sampler(Entry):
 
 @dataclass(frozen=True)
 class FrameSampler(Entry):
-    """A sampler of shots: it renders frames in order, since it reuses earlier frames, and no single images.
+    """A sampler of shots (frame sequences). It renders frames in order, since it reuses earlier frames. It renders no
+    single images.
 
     Its ``make`` (scene, seed, samples per pixel, memory in MiB, options) returns an object with
 
     ``film(index, motion, depth, changed)``  the film of frame number ``index`` of the shot. ``motion`` (H, W, 2) and
                                              ``depth`` (H, W) are as in ``data_gen.frames.motion``. ``changed`` is None
-                                             where only the camera moves, or else the frame's scene and its shapes
+                                             if only the camera moves. If more moves, it is the frame's scene and its
+                                             shapes
     ``confidence``                           the mean number of frames that a pixel of the last film counts for
     """
 
     _: KW_ONLY
     spp: int  # samples per pixel of a frame, where the user gives none
-    warm_up: int  # earlier frames to render again, as its history, when a shot is continued
+    warm_up: int  # number of earlier frames that it renders again when a shot is continued, so that it can reuse them
     alone: str  # the reason why it renders no single images, as part of a message
 
 
@@ -239,8 +241,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     return sampler
 
 
-# The default sampler, without gradients, and the default method. Others that take longer to compile, to render or to
-# explain replace them only where measurements show that they are better.
+# The default sampler, without gradients, and the default reconstruction method. Samplers and methods that take longer
+# to compile, to render or to explain replace the defaults only where measurements show that they are better.
 SIMPLE = ("primal", "oidn")
 
 
@@ -250,10 +252,11 @@ def tried(facts: Facts) -> list[Sampler]:
 
 
 def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
-    """The sampler and the method for "auto" in `ngpt render`, judged by the scene's description only, and the reason.
+    """Returns the sampler and the method for "auto" in `ngpt render`, chosen from the scene's description only, and the
+    reason.
 
-    Returns ``SIMPLE``, except in two cases: gradients are requested, or OIDN is missing, without which gradients give
-    better images. Then the method is "": the layers decide.
+    Sampler and method are ``SIMPLE``, except in two cases: gradients are requested, or OIDN is missing (without OIDN,
+    gradients give better images). In these cases the method is "", which means that the rendered layers decide.
     """
     sampler, reason = choose(facts)
     if gradients or METHODS[SIMPLE[1]].missing():
@@ -262,7 +265,7 @@ def described(facts: Facts, gradients: bool = False) -> tuple[str, str, str]:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler with gradients for "auto", judged by the scene's description only, and the reason."""
+    """Returns the sampler with gradients for "auto", chosen from the scene's description only, and the reason."""
     reasons: list[str] = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:
@@ -276,7 +279,7 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler lacks. "auto" has the options that all its samplers share."""
+    """Raises WrongUse for options that the sampler lacks. "auto" has those of ``COMMON`` that all its samplers have."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
         return

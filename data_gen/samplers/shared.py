@@ -1,4 +1,4 @@
-"""Parts of entries that several families share: rules to refuse a scene (``registry.Rule``), options and notes."""
+"""Parts that the entries of several samplers share: rules to refuse a scene (``registry.Rule``), options and notes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 # Integrators with media that our samplers can follow
 VOLUMETRIC = ("volpath", "volpathmis")
-# Integrators of paths
+# Mitsuba's path tracers, with and without media
 PATHS = ("path", *VOLUMETRIC)
 
 

@@ -1,4 +1,7 @@
-"""Whether the paths of a render share a cache of their tails: one rule for ``render_stack`` and our plugins."""
+"""Decides whether the paths of a render share their tails, that is, may end in a cache of light from other paths.
+
+``render_stack`` and our plugins use the same rule.
+"""
 
 from __future__ import annotations
 
@@ -52,6 +55,7 @@ def sharing_of(sensor: mi.Sensor, entry: Sampler, facts: Facts, settings: Mappin
         not_now = not_now or "there are few paths"
     if budget.memory < needed:
         not_now = not_now or f"it needs --memory {needed}"
-    # If the user insists on the cache and memory is too small for both, the cache comes on top of the budget.
+    # If the user insists on the cache, and memory is too small for it beside film and paths, the cache comes on top of
+    # the budget.
     beside = 0 if budget.memory < needed else own
     return Sharing(never, not_now, replace(budget, memory=budget.memory - beside))

@@ -2,15 +2,16 @@ r"""The beam radiance estimate: photons in media are gathered along whole rays, 
 
     b, d, Φ     a photon within radius r of a segment of the camera path, in the same medium; its direction; its power
     t           the distance along the segment to the point nearest to b
-    T(t)        the transmittance of the media up to there, in each colour
+    T(t)        the transmittance of the media up to the distance t, in each colour
     L           Σ T(t) f(d) Φ / (π r² N),    f: the phase function, N: light paths of the pass
 
 Camera paths go through media up to the next surface. No distance is sampled, each segment gathers over its whole
-length, and the blur is two-dimensional. So the same photons give less noise and less bias than near points.
+length, and the blur is two-dimensional. So the same photons give less noise and less bias than if they were gathered
+near points.
 
-In media whose density varies T is not known. There a ray samples collisions and ends at the first real one, so it
-reaches a point with the probability T. A photon counts as Φ / σs, with σs at its place, times σs at the nearest point
-of the ray.
+In grids, which are media whose density varies, T is not known. There a ray samples collisions and ends at the first
+real collision, so it reaches a point with the probability T. A photon counts as Φ / σs, where σs is the scattering
+coefficient at the photon, times σs at the nearest point of the ray.
 
 [Jarosz et al. 2008, "The Beam Radiance Estimate for Volumetric Photon Mapping"; Křivánek et al. 2014, "Unifying Points,
 Beams, and Paths in Volumetric Light Transport Simulation", short beams; the radius: radius.py]
@@ -64,9 +65,10 @@ class AlongRays:
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
-        """The light of photons beside a piece of a ray through one ``medium``, over paths that are not too long.
+        """Returns the light of photons beside a piece of a ray through one ``medium`` with the extinction ``σ``.
 
-        ``depth`` is the number of the segment. T is the transmittance within the piece.
+        ``depth`` is the number of the segment that contains the piece. Photons that would make a path too long are left
+        out. Here T is only the transmittance within the piece.
         """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
@@ -109,7 +111,7 @@ def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool],
 
 @dataclass
 class Along:
-    """The photons near camera paths that go piece by piece."""
+    """The photons that camera paths gather in ``by_pieces()``: on surfaces and in media."""
 
     on_surfaces: Gathering | None
     in_media: Any  # has ``light`` (piece of a ray, length, medium, σ, depth, active)
@@ -137,7 +139,7 @@ class BRE(PPM):
 
 @dr.syntax
 def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
-    """As ``by_vertices()``, but through media: piece by piece from boundary to boundary."""
+    """As ``by_vertices()``, but camera paths go through media, piece by piece from boundary to boundary."""
     scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
     connectable = world.materials.connectable
     parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
@@ -149,7 +151,7 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
     β, η = mi.Spectrum(importance), mi.Float(1)  # throughput and relative index of refraction at the piece
     depth = mi.UInt32(1)  # the number of the segment that contains the piece
     sky, active = Sky.from_camera(limits.hide_emitters), mi.Bool(True)
-    # In scenes with grids: whether the path has gone through one, and whether it continues behind a null collision
+    # In scenes with grids: whether the path has gone through a grid, and whether it continues behind a null collision
     grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
     if dr.hint(grids, mode="scalar"):
         channel = media.choose_channel(random.next_1d())
@@ -182,7 +184,8 @@ def by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, em
         if dr.hint(emission, mode="scalar"):
             met = active & ~first & (found | sky.seen)
             if dr.hint(grids and limits.shows, mode="scalar"):
-                # Le leaves out light that comes through a grid, and the sky: see ``behind_grids()``.
+                # Le leaves out light that comes through a grid, and the light of the sky: see ``behind_grids()``. Here
+                # both are added to L.
                 behind |= stop.passed > 0
                 met |= active & first & (behind | ~found)
             L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)

@@ -25,7 +25,7 @@ from ngpt.errors import NgptError
 
 # Bytes of a camera sample and its features, without the maps
 CAMERA_BYTES = 256
-# Bytes of a map in media: a word more for each vertex, and two for each light path
+# Bytes of a map in media: one more word for each vertex and two for each light path, all of them twice, as in MAP_BYTES
 MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 8 + 2 * 8
 # Additional bytes in scenes with grids: Φ / σs of each vertex
 GRID_BYTES = VERTICES_PER_PATH * 3 * 4
@@ -82,7 +82,7 @@ class PhotonIntegrator(GradientIntegrator):
         return Passes(self, world, pixel_width(scene, sensor))
 
     def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
-        """The photon maps of the pass, which trace ``photons`` light paths for each sample of the ``camera``."""
+        """Yields the photon maps of the pass, which has ``photons`` light paths for each sample of the ``camera``."""
         world, limits = passes.world, self.limits
         if world.lights.emitters is None or limits.max_depth <= 1:
             return

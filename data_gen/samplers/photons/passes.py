@@ -19,8 +19,8 @@ from data_gen.paths.light_ends import World
 class Passes:
     """The passes of a render, and the memory of one pass.
 
-    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``. The last gives
-    advice, besides a smaller image, that makes a camera sample fit into this number of bytes.
+    ``integrator`` has ``sample_pass(passes, camera, film)``, ``lane_bytes`` and ``instead(lane_bytes)``. ``instead``
+    gives advice, besides a smaller image, that makes a camera sample fit into this number of bytes.
     """
 
     integrator: Any

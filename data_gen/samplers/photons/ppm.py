@@ -6,9 +6,10 @@ r"""Progressive photon mapping: photons carry light to the surfaces that the cam
     L(x)        Σ f(x; -d) Φ / (A N),    N: light paths of the pass
     β           throughput of the camera path
 
-A camera path goes on at mirrors, glass, sharp gloss and holes. It ends at a smooth event at a material that scatters
-widely. All light scattered there comes from photons, even light directly from lamps. Emission that the camera path
-meets on its way is added in full. So each path of light is found in only one way.
+A camera path goes on at mirrors, glass, sharp gloss and holes. At a material that scatters widely, all smoothly (not
+specularly) scattered light comes from photons, even light directly from lamps, and the camera path goes on only by a
+specular event. Emission that the camera path meets on its way is added in full. So each path of light is found in only
+one way.
 
 [Hachisuka et al. 2008, "Progressive Photon Mapping"; Knaus and Zwicker 2011, radius.py]
 """
@@ -57,7 +58,9 @@ class Gathering:
         self.number, self.max_depth = number_of(traced.seed, traced.number), dr.opaque(mi.UInt32, max_depth)
 
     def light(self, si, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """L(x) at the vertex ``si`` on a surface, behind ``depth`` edges, over paths that are not too long."""
+        """Returns L(x) at the vertex ``si`` on a surface, ``depth`` edges from the camera. Photons that would make a
+        path too long are left out.
+        """
         longest = self.max_depth - depth
 
         def one(i, near):
@@ -78,7 +81,7 @@ class PPM(PhotonIntegrator):
     ``max_depth``            default -1: no limit
     ``rr_depth``             5
     ``hide_emitters``        false
-    ``radius``               3, of the first pass, in pixels (their median width at the surfaces that the camera sees)
+    ``radius``               3, the radius in the first pass, in pixels of median width at the surfaces that are seen
     ``photons``              1, the number of light paths in a pass for each pixel
     ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
 
@@ -86,8 +89,9 @@ class PPM(PhotonIntegrator):
     cannot find. The radius shrinks from pass to pass, so the mean of several short renders is not the image of a long
     one.
 
-    Not handled: media, polarised and spectral variants, emitters other than areas, points, spots and those infinitely
-    far away. Rendering raises NgptError for them.
+    Not handled: media, polarised and spectral variants, the material ``hair``, cameras without adjacent pixels
+    (meters), emitters other than areas, points, spots and those infinitely far away. Rendering a scene with any of
+    these raises NgptError.
     """
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
@@ -95,7 +99,7 @@ class PPM(PhotonIntegrator):
         start, values = begun(passes, camera)
         near = (one for traced in self.maps(passes, camera) for one in self.near(passes, traced))
         wavelengths = start.ray.wavelengths
-        # Emission that camera paths meet is counted with the first map, or without any.
+        # Emission that camera paths meet is added once: together with the first map, or alone if there is no map.
         L, Le = passes.frozen(self.light, passes.world, start, next(near, None), True)
         values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
         dr.eval(values)
@@ -117,7 +121,8 @@ class PPM(PhotonIntegrator):
 
 @dr.syntax
 def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
-    """L and Le of camera paths, vertex by vertex. L is the light gathered ``near`` and, on request, ``emission``.
+    """Returns L and Le of camera paths, which are traced vertex by vertex. L is the light gathered from ``near``, plus
+    the emission that the paths meet if ``emission`` is true.
 
     ``near.light`` is called with (vertex, its material, depth, active). ``near`` may be None.
     """

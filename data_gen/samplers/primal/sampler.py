@@ -27,17 +27,18 @@ from data_gen.tails.cache import Known
 
 
 def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
-    """The sampler ``primal``. Without ``features`` it renders only the primal. ``places`` chooses lamps by place.
+    """Makes the sampler ``primal``. Without ``features`` it renders only the primal. ``places`` chooses lamps by place.
 
-    With ``tails`` "shared" the tails of paths come from a cache, see ``data_gen.tails``.
+    With ``tails`` "shared", paths may end in a cache of light, see ``data_gen.tails``.
     """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in PATHS and not mi.is_polarized
     errs = places or loses_light(scene, integrator) or bent_lamp(scene)
     if not (tails == "shared" or (followed and errs)):
         return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
-    # Mitsuba's integrators choose lamps with the same probabilities everywhere, and use vertex normals. Behind holes
-    # our paths trace a quarter fewer rays than ``prb``.
+    # Here the paths of ``gpt`` replace Mitsuba's. Mitsuba's integrators choose lamps with the same probabilities
+    # everywhere, and have wrong densities for lamps with vertex normals. In scenes with holes, where ``path`` loses
+    # light, our paths trace a quarter fewer rays than ``prb``.
     view = SAMPLERS["gpt"].integrator(scene, places=places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)
@@ -50,9 +51,9 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
 
 
 def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *, integrator, features: bool) -> dict:
-    """As ``samples()``, with the base paths of ``gpt``, which may end in the ``known`` part of the cache.
+    """As ``samples()``, with the base paths of ``gpt``. They may end where the cache has ``known`` light.
 
-    If they may, the layer ``shared`` is a sample of the error of the light from the cache.
+    If paths may end in a cache, there is a layer ``shared``: a sample of the error of the light from the cache.
     """
     errors = []
 
@@ -70,7 +71,7 @@ def our_samples(view, plan: Plan, camera: CameraSamples, known: Known | None, *,
 
 
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
-    """Layers: one sample of ``radiance``, and of features, for each camera sample.
+    """Returns layers: for each camera sample, one sample of ``radiance`` and, if wanted, of ``features``.
 
     With ``features``, directly seen emission is the mean over the quarters of a pixel.
     """

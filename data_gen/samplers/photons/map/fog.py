@@ -22,7 +22,8 @@ class Fog:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str):
         self.media = Media(scene)
         self.within = mi.MediumPtr(sensor.get_medium())
-        # The start of a ray. For a meter on a shape, or one infinitely far away, to_world does not give it.
+        # The start of a camera ray. For a meter on a shape, or a meter infinitely far away, to_world does not give this
+        # point.
         middle = mi.Point2f(0.5)
         self.eye = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)[0].o
         corner = mi.Point3f(scene.bbox().max) + float(np.linalg.norm(np.array(scene.bbox().extents())))
@@ -37,8 +38,8 @@ class Fog:
     def around(self, scene, p: mi.Point3f) -> mi.MediumPtr:
         """The medium around points ``p``. Mitsuba does not know the medium of a lamp that is not a boundary itself.
 
-        The first boundary on the way to the camera gives the medium on its side of ``p``. Without a boundary it is the
-        camera's medium. Other surfaces on the way have the same medium on both sides.
+        The first boundary on the way from ``p`` to the camera gives the medium on the side where ``p`` is. If there is
+        no boundary, the medium is the camera's. Other surfaces on the way have the same medium on both sides.
         """
         to = self.eye - p
         distance = dr.norm(to)
@@ -62,10 +63,11 @@ class Fog:
         return segment, vertex(segment.ray, segment.hit, segment.place)
 
     def power(self, photons) -> mi.Spectrum:
-        """The weight of each photon of a map in media: the power Φ that is scattered there, or Φ / σs with grids.
+        """Returns the weight of each photon of a map in media. It is the power Φ that is scattered at the photon, or
+        Φ / σs in scenes with grids, where σs is the scattering coefficient.
 
-        The sum of Φ / σs over a volume is the light that goes through it, which is smooth even if σs is not. σs is then
-        evaluated where the camera path scatters, so the density of a grid is not blurred.
+        The sum of Φ / σs over a volume is the light that goes through it. This light is smooth, even where σs is not.
+        It is multiplied by σs only where the camera path scatters, so the density of a grid is not blurred.
         """
         if not self.media.grids:
             return photons.β

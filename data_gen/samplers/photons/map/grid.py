@@ -1,8 +1,8 @@
-"""Search for photons by place: a dense uniform grid, whose cells are runs of one sorted list.
+"""Search for photons by place, in a dense uniform grid. Each cell is a run of entries in one sorted list.
 
 The edge of a cell is at least the diameter of the ball in which photons are gathered. So a ball touches at most two
-cells along each axis: four rows of two cells, which are neighbours in the list. Counts and a stable sort build the
-list, and photons are gathered in its order, so sums have the same bits every time.
+cells along each axis. These are four rows of two cells, and the two cells of a row are neighbours in the list. Counts
+and a stable sort build the list, and photons are gathered in its order, so sums have the same bits every time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# With more cells for each photon most cells are empty, and larger cells cost less.
+# With more cells for each photon, most cells would be empty, and larger cells would cost less.
 _CELLS_PER_PHOTON = 4
 _LEAST_CELLS = 1 << 12
 
@@ -80,10 +80,11 @@ class Grid:
         return dr.gather(mi.UInt32, self.start, cell, active), dr.gather(mi.UInt32, self.start, cell + 2, active)
 
     def each(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """``state`` after ``visit`` (state, place in the list, near) for all points that may be near ``p``.
+        """Returns ``state`` after a call of ``visit`` (state, place in the list, near) for each point that may be near
+        ``p``.
 
-        ``near`` says whether a point is within the radius, and ``visit`` must change nothing if not. May be called
-        within symbolic loops.
+        ``near`` says whether the point is within the radius. If it is not, ``visit`` must change nothing. ``each`` may
+        be called within symbolic loops.
         """
 
         def nearer(q, k):
@@ -93,13 +94,13 @@ class Grid:
         return self.rows((none, none + 4), lambda k: p, nearer, active, visit, state)
 
     def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
-        """As ``each()``, for points within the radius of a piece of a ray, but not past its ends.
+        """As ``each()``, for points within the radius of a piece of a ray, but not past the ends of the piece.
 
-        The piece is cut into parts, so short that the points near a part lie in two cells along each axis. Each point
-        belongs to only one part.
+        The piece is cut into parts. They are so short that the points near a part lie in two cells along each axis.
+        Each point belongs to only one part.
         """
-        # Half the length of a part. All points near the part lie in a ball about its middle, whose radius is half an
-        # edge.
+        # Half the length of a part. All points near the part lie in a ball about the part's middle. The radius of this
+        # ball is half the edge of a cell.
         half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))
         rate = dr.rcp(2 * half)
         # The interval in which the ray is inside the grid
@@ -124,7 +125,8 @@ class Grid:
         return self.rows((4 * first, 4 * last), middle, beside, crosses, visit, state)
 
     def rows(self, numbers: tuple, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
-        """``state`` after visits to all points in rows ``numbers`` = (from, to); k is row k % 4 near ``center`` (k).
+        """Returns ``state`` after visits to all points in the rows with ``numbers`` (from, to). Row number k is row
+        k % 4 of the cells near the point ``center`` (k).
 
         ``is_near`` (point, k) says whether a point is within the radius.
         """
@@ -149,9 +151,10 @@ class Grid:
         return dr.while_loop(begun, goes_on, step, label="gather")[3]
 
     def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
-        """``total`` plus the sum of ``value`` (place in the list, near) over all points within the radius of ``p``.
+        """Returns ``total`` plus the sum of ``value`` (place in the list, near) over all points within the radius of
+        ``p``.
 
-        ``value`` returns the type of ``total``, and must return 0 where not ``near``. May be called within symbolic
-        loops.
+        ``value`` returns the type of ``total``, and must return 0 where ``near`` is false. ``gather`` may be called
+        within symbolic loops.
         """
         return self.each(p, radius2, active, lambda sums, i, near: (sums[0] + value(i, near),), (total,))[0]

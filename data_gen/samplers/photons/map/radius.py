@@ -1,22 +1,25 @@
 r"""The radius within which photons are gathered. It is given in pixels, and shrinks from pass to pass.
 
-Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1). d is the dimension in which photons are gathered: 2
-for disks, 3 for balls. So r^d falls like i^(α - 1). The variance of the mean over passes goes to zero like i^-α, and
-its bias like r², that is i^(2 (α - 1) / d). Passes are independent, and no point keeps statistics (Knaus and Zwicker
-2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15 and 24).
+Pass i, counted from 1, gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1). d is the dimension in which
+photons are gathered: 2 for disks, 3 for balls. α is ``ALPHA``. So r^d falls like i^(α - 1). The variance of the mean
+over passes goes to zero like i^-α, and its bias like r², that is i^(2 (α - 1) / d). Passes are independent, and no
+statistics are kept for points (Knaus and Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15
+and 24).
 
-Beyond the edge of a surface there are no photons, so the area of surface in the disk about a point also matters.
+Beyond the edge of a surface there are no photons. So the light at a point x also depends on the area of the surfaces in
+the disk of radius r about x.
 
     A           area of the surfaces within radius r of x from which photons are gathered
     w           weight of a probe, which is a line normal to the disk: 1 / cos where it meets such a surface, else 0.
                 Its mean is A / (π r²)
 
 If the light of photons were divided by π r², a uniformly lit surface would be too dark along its edges, in proportion
-to r. Divided by A, it is right. An unbiased estimate of π r² / A is the sum of the products (1 - w₁) ... (1 - wₖ) over
-k = 0, 1, ... On a plane it has one term and needs one probe.
+to r. Dividing by A gives the right light. An unbiased estimate of π r² / A is the sum of the products
+(1 - w₁) ... (1 - wₖ) over k = 0, 1, ... On a plane every w is 1, so only the term for k = 0 is left, and the sum needs
+one probe.
 
 The place and the pass determine the random numbers of the probes. So in each pass the estimate depends only on x, not
-on the path that leads there.
+on the path that leads to x.
 
 [the sum: Booth 2007, "Unbiased Monte Carlo Estimation of the Reciprocal of an Integral"]
 """
@@ -38,7 +41,9 @@ ALPHA = 2 / 3
 
 
 def shrunk(i: int, dimension: int = 2) -> float:
-    """r_i / r_0, i from 0, for photons that are gathered in a disk (``dimension`` 2) or a ball (3)."""
+    """Returns the radius of pass ``i`` divided by the radius of the first pass, which has i = 0 here. Photons are
+    gathered in a disk (``dimension`` 2) or a ball (3).
+    """
     # The product of (k + α) / (k + 1) over k = 1 .. i, computed by the Gamma function
     log_ratio = math.lgamma(i + 1 + ALPHA) - math.lgamma(1 + ALPHA) - math.lgamma(i + 2)
     return math.exp(log_ratio / dimension)
@@ -62,13 +67,14 @@ def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     return float(wide)
 
 
-# Most rays for a point. Objects much narrower than the radius need more, and stay a bit too dark.
+# The most rays for a point. Objects much narrower than the radius would need more rays, and stay a bit too dark.
 RAYS = 24
-# A smaller term ends the sum.
+# The sum ends at a term that is smaller than this.
 LEAST = 0.01
-# Places per radius: nearby points get the same random numbers, so rounding does not matter.
+# Points are rounded to places, this number per radius. So points that differ only by rounding errors usually get the
+# same random numbers.
 PLACES = 8
-# Rounds of the hash. With Mitsuba's 4 the probes of a point are correlated, and all may miss.
+# Rounds of the hash. With 4, Mitsuba's default, the probes of a point are correlated, and all of them may miss.
 ROUNDS = 8
 
 
@@ -87,7 +93,7 @@ def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: 
     other, _ = mi.sample_tea_32(place[1], place[2], ROUNDS)
     place, _ = mi.sample_tea_32(place[0] ^ number, other, ROUNDS)
     total, term, rays = mi.Float(0), mi.Float(1), mi.UInt32(0)
-    # The rest of a probe
+    # The part of a probe that is not traced yet, and whether a new probe begins
     ray, begins = mi.Ray3f(x.p, -n, dr.zeros(mi.Float), x.time, x.wavelengths), mi.Bool(True)
     going = mi.Bool(active)
     while dr.hint(going, label="probes of edges"):

@@ -1,11 +1,11 @@
 """Traces light paths into a map of vertices: all paths in one kernel, each with its own places in the map.
 
-So vertices are ordered by path, then by bounce, and the same seed gives the same map. (With a counter for places, the
-order would depend on threads.) Places that a path does not need stay empty, and have depth 0.
+So vertices are ordered by path, then by bounce, and the same seed gives the same map. (If paths took their places from
+a shared counter, the order would depend on threads.) Places that a path does not need stay empty, and have depth 0.
 
 Points where light scatters in media are vertices, too. Their normal is 0, and their power is the scattered power. The
-sum of it over a volume is σs times the light that goes through, so a camera path multiplies it only by its
-transmittance.
+sum of this power over a volume is the scattering coefficient σs times the light that goes through. So a camera path
+does not multiply it by σs again.
 """
 
 from __future__ import annotations
@@ -70,7 +70,8 @@ def trace(world: World, random: mi.Sampler, max_depth: int, rr_depth: int, froze
         paths, numbers, photons = frozen(_walk, world, paths, random, depths, photons, (place + used, end))
         dr.eval(paths, numbers, photons)
         random = type(random)(numbers)
-        # The first place of each path in further maps stays empty, so that sums over photons keep their last bits.
+        # In further maps the first place of each path stays empty. So sums over photons are grouped, and rounded, in
+        # the same way as in earlier versions.
         used = 1
         yield photons
 
@@ -150,9 +151,9 @@ def event(si: mi.SurfaceInteraction3f, where: media.Place | None, random, exists
 
 
 def lives(sample, β: mi.Spectrum, brightest: mi.Float, u: mi.Float, exists: mi.Bool, plays: mi.Bool) -> tuple:
-    """Which light paths survive an event, after which they have power β, and the probability to survive.
+    """Returns which light paths survive an event, and their probability to survive. β is the power after the event.
 
-    Where it ``plays``, Russian roulette depends on the share of the path's initial light that is left.
+    Where Russian roulette ``plays``, it depends on the share of the path's initial light that is left.
     """
     survival = roulette(dr.max(β) * brightest, plays)
     return exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u < survival), survival

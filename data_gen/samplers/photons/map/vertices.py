@@ -54,8 +54,8 @@ def vertices_class(variant: str, in_media: bool = False) -> type:
 
         p: mi.Point3f
         n: mi.Normal3f  # geometric; 0 where light scatters in a medium
-        d: mi.Vector3f  # of the light that arrives
-        β: mi.Spectrum  # its power, times the number of light paths
+        d: mi.Vector3f  # direction of the light that arrives
+        β: mi.Spectrum  # power of the light that arrives, times the number of light paths
         depth: mi.UInt32  # edges from the light; 0 where nothing is gathered
 
         def __len__(self) -> int:
@@ -68,7 +68,7 @@ def vertices_class(variant: str, in_media: bool = False) -> type:
     class VerticesInMedia(Vertices):
         """14 words each."""
 
-        medium: mi.MediumPtr  # around it
+        medium: mi.MediumPtr  # the medium around the vertex
 
     return VerticesInMedia
 
