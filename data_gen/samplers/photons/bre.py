@@ -124,7 +124,8 @@ class BRE(PPM):
 
     Biased, and consistent: the mean over passes converges to the image of ``volpath``.
 
-    Not handled: light from infinitely far away through a medium without bounds, and what ``ppm`` does not handle.
+    Not handled: light from infinitely far away through a medium without bounds, scenes without media, and what ``ppm``
+    does not handle, except media.
     """
 
     follows, map_bytes = "volpath", MEDIA_MAP_BYTES
