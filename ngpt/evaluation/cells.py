@@ -82,7 +82,7 @@ class Scorer:
         return cell
 
     def floors(self, reference: Reference) -> dict[str, float | None]:
-        """The metrics between the two halves of a reference, which show its noise; {} for a reference of one image.
+        """The metrics between the two halves of a reference, which show the reference's noise; {} if it is one image.
 
         Squared metrics are left out, because with two halves they do not include this noise.
         """

@@ -21,8 +21,8 @@ from ngpt.stack import GradientStack
 
 # The ends of the names of two halves, before ".exr".
 HALVES = ("-a", "-b")
-# The largest difference in exposure between a reference and a render. Reconstructions differ less from a reference, but
-# renders of few samples, and fireflies, may differ more.
+# The largest difference in exposure that is allowed between a reference and a render. Reconstructions differ less than
+# this from a reference, but renders with few samples, or with fireflies, may differ more than reconstructions.
 MOST_STOPS = 1.0
 
 

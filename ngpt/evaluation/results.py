@@ -73,7 +73,7 @@ def _is_timed(row: dict[str, Any]) -> bool:
 
 
 def _is_ahead(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether ``a`` is at least as fast and as good as ``b``, and better in one of the two."""
+    """Whether ``a`` is at least as fast and at least as good as ``b``, and also faster or better."""
     pairs = ((a["seconds"]["total"], b["seconds"]["total"]), (a["error"], b["error"]))
     return _is_timed(a) and all(x <= y for x, y in pairs) and any(x < y for x, y in pairs)
 

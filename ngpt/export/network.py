@@ -74,7 +74,7 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
 
 
 def _base_reach(model: Reconstructor) -> int:
-    """How far, in pixels, the base and the smoothing of its weights read, rounded up to the alignment."""
+    """How far, in pixels, the base and its smoothed weights read, a multiple of the alignment; 0 without a base."""
     return -(-(len(schedule()) + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 

@@ -8,8 +8,8 @@ A reference has noise. With one image r = t + n, where t is the truth, the mean 
 the mean of n². With two halves, the square becomes the product (x - a)(x - b). The noise of a and b is independent and
 has mean zero, so the expectation of the product is (x - t)², whatever the noise. The product in a pixel, and even a
 mean, may be negative if the image is closer to the truth than the reference. Denominators use the mean m = (a + b) / 2.
-Its noise is not corrected for: a relative variance v of m adds about 6 v² to relMSE, and 4 v times a relative bias of
-the image.
+The noise of m is not corrected for: if m has the relative variance v, and the image the relative bias β, this noise
+adds about 6 v² + 4 v β to relMSE.
 """
 
 from collections.abc import Callable, Iterable
@@ -44,9 +44,9 @@ def relmse(image: np.ndarray, *halves: np.ndarray) -> float:
 
 
 def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> float:
-    """relMSE without the worst 0.1 % of the pixels, by the mean over channels, so that fireflies do not dominate.
+    """relMSE without the worst 0.1 % of the pixels, so that fireflies do not dominate.
 
-    With two halves, the worst pixels have the largest (x - m)² / (m² + 1e-3).
+    The worst pixels have the largest (x - r)² / (r² + 1e-3), averaged over channels. With two halves, r is m here.
     """
     errors, sizes = (relative_squared_error(image, *r) for r in (halves, (middle(halves),)))
     return trimmed_mean(errors, sizes, share)

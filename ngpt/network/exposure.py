@@ -4,8 +4,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-# The typical radiance of an image after exposure. Its logarithm is ln(1 + 4) = 1.6, so radiance that is 40 times darker
-# is still compressed.
+# The typical radiance of an image after exposure. Its logarithm is ln(1 + 4) = 1.6. Radiance that is 40 times darker is
+# 0.1 after exposure, and ln(1 + x) still compresses it a little.
 KEY = 4.0
 # The side, in pixels, of the blocks that are averaged for the exposure.
 BLOCK = 16

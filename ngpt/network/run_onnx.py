@@ -137,7 +137,10 @@ class Network:
                 memory = self._less(layers["primal"].shape[:2], memory, batch, error)
 
     def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
-        """Half of the MiB of the tiles that were too large; raises ``error`` if the tiles cannot be smaller."""
+        """Half of the MiB that the last tiles took, or those of the smallest tile.
+
+        Raises ``error`` if that is not less than the last tiles took.
+        """
         _, (rows, columns) = self.plan(*size, memory, batch)
         areas = rows * columns, tiles.smallest(size, self.alignment, self.overlap)
         used, least = (area * self.bytes * batch / 2**20 for area in areas)

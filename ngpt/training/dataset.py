@@ -37,8 +37,8 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 class ShardCrop:
     """A crop. Its pixels are read only when they are used.
 
-    ``spp`` holds the samples per pixel of its inputs. ``frame`` is its number in a shot, from 0; None for a single
-    image.
+    ``spp`` holds the samples per pixel of the inputs. ``frame`` is the number of the crop in a shot (a frame sequence),
+    from 0; None for a single image.
     """
 
     shard: Shard

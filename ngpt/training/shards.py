@@ -81,8 +81,9 @@ class CropData:
 
     ``stacks``             K inputs with finite values, with ``spp`` samples per pixel
     ``reference``          the converged image (H, W, 3); None for a pair
-    ``reference_direct``   the directly visible emission in it; None for a pair
-    ``reference_caustic``  the light in it that the layer ``caustic`` of inputs estimates; None without such a layer
+    ``reference_direct``   the directly visible emission in the reference; None for a pair
+    ``reference_caustic``  the light in the reference that the layer ``caustic`` of inputs estimates; None if there is
+                           no such layer
     ``halves``             two independent images, each from half of the reference's samples, without
                            ``reference_caustic``; () if the reference is not made of halves
     ``motion``             (H, W, 2), the motion of a frame of a shot, NaN where it is unknown; None for single images

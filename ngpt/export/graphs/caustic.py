@@ -1,8 +1,8 @@
 """``ngpt.denoisers.caustic`` and ``diffusion`` as a graph: denoises the light that gradients exclude.
 
-At one distance after the other, each pixel exchanges light with its four neighbours in one half plane. Each exchange is
-added to one pixel and subtracted from the other, so no light is lost. Surfaces beyond the border are so far away that
-no light is exchanged with them.
+There are several distances, one after the other. At each distance, every pixel exchanges light with its four neighbours
+in one half plane. Each exchange is added to one pixel and subtracted from the other, so no light is lost. Surfaces
+beyond the border count as so far away that no light is exchanged with them.
 """
 
 from collections.abc import Mapping
@@ -74,7 +74,7 @@ def _moved(padded: Value, start: Value, size: Value) -> Value:
 
 
 def _surfaces(layers: Mapping[str, Value], depth: Value) -> Value:
-    """Albedo, normals and the logarithm of the depth, as far as the model reads them; a constant without any."""
+    """Albedo, normals and the logarithm of the depth, as far as the model reads them; a constant if it reads none."""
     planes = [layers[name] for name in ("albedo", "normal") if name in layers]
     if "depth" in layers:
         planes.append(op.Log(op.Max(layers["depth"], depth * FARTHEST + 1e-37)))

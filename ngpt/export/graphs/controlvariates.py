@@ -1,4 +1,7 @@
-"""``ngpt.classical.controlvariates`` as a graph: wcv. The channels are the neighbours right, below, left and above."""
+"""The method wcv of ``ngpt.classical.controlvariates`` as a graph.
+
+The channels are the right, lower, left and upper neighbour of a pixel.
+"""
 
 import numpy as np
 

@@ -14,9 +14,10 @@ KINDS = ("structural", "elpips-squeeze", "elpips-vgg")
 
 
 def tone_mapped(image: Tensor) -> Tensor:
-    """R(x) = x / (1 + mean over channels of |x|), (N, 3, H, W): keeps hues; a saturated pixel tends to 3, grey to 1.
+    """R(x) = x / (1 + mean over channels of |x|), (N, 3, H, W), which keeps hues.
 
-    [Kettunen et al. 2019, section 5.1, and their code]
+    As x grows, R tends to 1 for grey, and to 3 for a colour of only one channel [Kettunen et al. 2019, section 5.1, and
+    their code].
     """
     return image / (1 + image.abs().mean(1, keepdim=True))
 

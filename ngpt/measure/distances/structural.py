@@ -19,9 +19,10 @@ def structural_distance(a: Tensor, b: Tensor) -> Tensor:
 
         Σ_s w_s (1 - CS_s)  +  w_5 (1 - L_5)  +  Σ_s w_s mean (1 - GMS_s)
 
-    CS and L are contrast-structure and luminance of SSIM at scale s, L at the coarsest [Wang et al. 2003, eq. 7, as a
-    sum of distances rather than a product, which has no gradient where one factor is 0]; GMS is the similarity of
-    gradient magnitudes [Xue et al. 2014, eq. 4].
+    CS_s is the contrast-structure of SSIM at scale s, and L_5 its luminance at the coarsest scale [Wang et al. 2003,
+    eq. 7]. There, the parts are multiplied. Here, their distances are added, because a product has no gradient where
+    one factor is 0. GMS_s is the similarity of gradient magnitudes at scale s [Xue et al. 2014, eq. 4]. w_s are the
+    weights of the scales.
     """
     a, b = a.float(), b.float()
     weights = _weights(a)
