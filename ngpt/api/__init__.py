@@ -1,1 +1,1 @@
-"""Doors for arrays: images in and out, of NumPy, PyTorch, Dr.Jit or Mitsuba."""
+"""Functions for images in memory, which come from and return to NumPy, PyTorch, Dr.Jit or Mitsuba."""

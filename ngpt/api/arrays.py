@@ -26,7 +26,7 @@ T = TypeVar("T")
 # Layers that methods read and Mitsuba's denoiser does not
 _FURTHER = ("depth", "dx", "dy", "direct", "caustic", "primal_var", "dx_var", "dy_var", "caustic_var")
 _BESIDE = ("albedo", "normal", *_FURTHER)
-# Inputs of a Denoiser that its constructor must announce -> the keyword for that
+# Inputs of a Denoiser that must be announced to its constructor -> the keyword that announces them
 _ANNOUNCED = {"albedo": "albedo", "normals": "normals", "flow": "temporal", "previous_denoised": "temporal"}
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
 _TO_CAMERA = np.array([-1, 1, -1], np.float32)
@@ -104,8 +104,8 @@ def denoise(
                  space, +x right, +y up, +z toward the viewer (``Denoiser`` converts Mitsuba's normals)
     ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
                  a gradient stack
-    ``wrap``     whether the image is a panorama, whose left and right borders are neighbours. A stack may be marked as
-                 one (``ngpt:wrap`` or ``envmap`` in its header)
+    ``wrap``     whether the image is a panorama, whose left and right borders are neighbours. The header of a stack may
+                 also mark it as a panorama (``ngpt:wrap`` or ``envmap``)
 
     All further keywords are options of the method, which are listed below. Raises NgptError for shapes and types that
     do not fit, for unknown names, if a layer that the method needs is missing, and for an image without any finite
@@ -211,7 +211,7 @@ class Denoiser:
         previous_denoised_ch: str = "",
         **layers: Any,
     ) -> Any:
-        """Reconstructs ``noisy``. The result has its kind (array, tensor on its device, bitmap), type and shape.
+        """Reconstructs ``noisy``. The result has the same kind (array, tensor on a device, bitmap), type and shape.
 
         ``noisy``      (H, W, 3), or (H, W, 4) with alpha, scene-linear
         ``albedo``     (H, W, 3)
@@ -221,13 +221,14 @@ class Denoiser:
         ``flow``       (H, W, 2) as OptiX defines it, the layer ``motion`` times -1: pixels to the right and down, from
                        the place of this point in the last frame to its place in this one; 0 where it is not known, NaN
                        where the point was not seen
-        ``previous_denoised``  the last result; only needed if it was changed since then, or made elsewhere. ``noisy``
-                       itself, which OptiX requires in a first frame, begins another shot
+        ``previous_denoised``  the last result; only needed if it was changed since then, or made elsewhere. If it is
+                       ``noisy`` itself, as OptiX requires in a first frame, another shot (sequence of frames) begins
         ``layers``     ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``,
                        ``caustic_var``: layers as in ``GradientStack``
 
-        A bitmap may hold these as channels. Then their names are given: ``denoiser(bitmap, "albedo", "normals",
-        to_sensor)``, or ``albedo_ch="albedo"`` and so on. ``noisy_ch`` is the layer to denoise, by default the root.
+        A bitmap may hold these layers as channels. Then the names of channels are given: ``denoiser(bitmap, "albedo",
+        "normals", to_sensor)``, or ``albedo_ch="albedo"`` and so on. ``noisy_ch`` is the layer to denoise, by default
+        the root.
 
         Raises NgptError for arrays of another size, for layers that were not announced, for announced layers that are
         missing, and as ``ngpt.denoise`` does.

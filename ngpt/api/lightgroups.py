@@ -1,12 +1,13 @@
-"""Light groups that are denoised so that they still add up to the image, for relighting in compositing.
+"""Denoises light groups so that they still add up to the image, for relighting in compositing.
 
-Each group is denoised by itself, since it has shadows of its own. Let d_i be the denoised groups and D the denoised
-image. The difference between D and the sum of the groups is divided among them, in each pixel in proportion to their
-light there:
+A light group is the image in the light of some of the lamps. Each group is denoised by itself, because it has shadows
+of its own. Let d_i be the denoised groups and D the denoised image. In each pixel, the difference between D and the sum
+of the d_i is divided among the groups in proportion to their light:
 
     o_i = d_i + (D - Σ d_j) |d_i| / Σ |d_j|
 
-So Σ o_i = D for any method, and no group becomes negative. Light in no group counts as one more group.
+So the results o_i add up to D for any method, and they are not negative if D and the d_i are not. Light that belongs to
+no group counts as one more group.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,9 +24,9 @@ from ngpt.stack import GradientStack
 
 # Renderer -> the name of a group's layer, with * in place of the group's own name
 PATTERNS = {"Cycles": "Combined_*", "Arnold": "RGBA_*"}
-# The header's list of groups of a result.
+# Header attribute of a result: the list of its groups
 ATTRIBUTE = "ngpt:groups"
-# The largest share of light in no group that may be due to rounding
+# If the share of light that belongs to no group is not above this, it counts as an error of rounding.
 NEGLIGIBLE = 2e-3
 
 
@@ -34,7 +35,7 @@ def find(stack: GradientStack, patterns: Sequence[str] = ()) -> dict[str, np.nda
 
     ``patterns``  patterns of layer names, such as "Combined_*"; by default ``PATTERNS``
 
-    If a file has several view layers, only groups in the view layer of the primal count. Raises NgptError if there are
+    If a file has several view layers and that of the primal has groups, only these count. Raises NgptError if there are
     no groups, or if they are denoised already.
     """
     if ATTRIBUTE in stack.attributes:
@@ -60,7 +61,7 @@ def denoised(
     """The denoised groups (H, W, 3) float32, which add up to ``whole``, the reconstruction of the stack's primal.
 
     ``method`` and ``options`` are those that made ``whole``. Groups have neither gradients nor variances. If the method
-    needs these, "auto" chooses another one for an image with the stack's features.
+    needs gradients or variances, "auto" chooses another method for an image with the stack's features.
     """
     features = {name: stack[name] for name in ("albedo", "normal", "depth", "alpha") if name in stack}
     if method == "auto" or not set(METHODS[method].needs) <= {"primal", *features}:

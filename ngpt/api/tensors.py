@@ -11,7 +11,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
-# The channels of colour, albedo and normal: a tensor with at least this number may be the output of an integrator.
+# The number of channels of colour, albedo and normal. A tensor with at least as many may come from an integrator.
 _OF_A_STACK = 9
 
 
@@ -80,7 +80,8 @@ def _detached(value: Any, name: str) -> str:
 def like(image: np.ndarray, example: Any) -> Any:
     """The image (H, W, C) as an object of the same library, device and number type as ``example``.
 
-    For a bitmap, it is an RGB or RGBA bitmap. For objects of unknown kinds, it is a NumPy array.
+    If the example is a bitmap, the result is an RGB or RGBA bitmap. If it is of an unknown kind, the result is a NumPy
+    array.
     """
     if isinstance(example, np.ndarray):
         return _of_type(image, example.dtype) if example.dtype.kind == "f" else image

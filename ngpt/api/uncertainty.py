@@ -1,9 +1,9 @@
 """Estimates the standard error of each pixel of a reconstruction, for any method.
 
-The method runs a second time on a stack with added noise, which has the variances of the stack. Noise that pixels share
-is added from the layer ``shared``, because a denoiser removes white noise but not this noise. The standard error is the
-change of the image over about 9x9 pixels, times a factor that was measured for each method. docs/use/uncertainty.md
-says how good the estimate is, and where it fails.
+The method runs a second time on the stack with added noise. The variances of the added noise are those of the stack.
+Noise that pixels share is added from the layer ``shared``, because a denoiser removes white noise but not shared noise.
+The standard error is the root mean square change of the image over about 9x9 pixels, times a factor that was measured
+for each method. docs/use/uncertainty.md says how good the estimate is, and where it fails.
 """
 
 from dataclasses import replace
@@ -34,9 +34,9 @@ def reconstruct_with_error(
 ) -> Result:
     """Like ``ngpt.reconstruct``, but with ``Result.error``: the standard error (H, W, 3) float32, in the image's unit.
 
-    It takes twice the time. ``halves`` are two stacks of independent halves of the samples, such as the ones that
-    ``stack`` was merged from. They reduce the number of values that are more than five standard errors off to 0.4 to
-    0.75 times, in four times the time.
+    It takes twice the time of ``ngpt.reconstruct``. ``halves`` are two stacks of independent halves of the samples,
+    such as those that ``stack`` was merged from. With halves, it takes four times the time of ``ngpt.reconstruct``, and
+    0.4 to 0.75 times as many values are wrong by more than five standard errors.
 
     The error is NaN in pixels where a variance is not finite. The same stacks give the same bits. Raises NgptError if
     the stack has no variances, if a half is of another size or place, if both halves have the same seed, and as
@@ -81,10 +81,10 @@ def known_noise(stack: GradientStack) -> np.ndarray:
 
 
 def noisier(stack: GradientStack) -> GradientStack:
-    """The stack with added noise of its variances; no noise is added where these are not finite.
+    """Returns the stack with added noise of the stack's variances. Where a variance is not finite, no noise is added.
 
-    The layer ``shared`` is added as it is, and white noise of the other part of the variance. Raises NgptError if the
-    stack lacks variances.
+    As the noise that pixels share, the layer ``shared`` is added as it is. White noise is added for the other part of
+    the variance. Raises NgptError if the stack lacks variances.
     """
     stack.require("primal_var", why="an estimate of the error")
     for name in ("dx", "dy"):
@@ -93,7 +93,7 @@ def noisier(stack: GradientStack) -> GradientStack:
     rng = np.random.default_rng(SEED)
     layers = {}
     for name, variance in VARIANCES.items():
-        # Drawn also for missing layers, so that these do not change the noise of others.
+        # Noise is drawn for missing layers too, so that the noise of other layers does not depend on them.
         drawn = rng.standard_normal(stack["primal"].shape, np.float32)
         if name in stack and variance in stack:
             known = np.maximum(np.nan_to_num(stack[variance], posinf=0.0), 0)
@@ -108,7 +108,7 @@ def noisier(stack: GradientStack) -> GradientStack:
                 noise = np.sqrt(np.maximum(own, 0)) * drawn + np.where(known > 0, shared, 0)
             layers[name] = stack[name] + noise
     if "caustic" in layers:
-        # The caustic is part of the primal, whose noise above is only that of its other light.
+        # The caustic is part of the primal, but the noise added to the primal above is only that of its other light.
         layers["primal"] = layers["primal"] + (layers["caustic"] - stack["caustic"])
     if not stack.fine or "primal" not in layers:
         return stack.replace(**layers)

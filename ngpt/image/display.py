@@ -83,7 +83,7 @@ def auto_exposure(reference: np.ndarray) -> float:
 def signed_map(gradient: np.ndarray) -> np.ndarray:
     """The colours of a gradient layer (H, W, 3): zero is grey, negative blue, positive orange.
 
-    They show the mean over RGB, linearly up to the 99th percentile of its magnitude.
+    The colours show the mean over RGB, linearly up to the 99th percentile of the mean's magnitude.
     """
     value = _rgb(gradient).mean(axis=2)
     magnitude = np.abs(value[np.isfinite(value)])
@@ -129,7 +129,7 @@ def heat_table() -> np.ndarray:
 
 
 def sign_table() -> np.ndarray:
-    """Colours from blue through grey to orange, (255, 3) uint8 sRGB. Their number is odd, so that one is for zero."""
+    """Colours from blue through grey to orange, (255, 3) uint8 sRGB. Their number is odd: the middle one is zero."""
     return colour_table(_DIVERGING, 255)
 
 
@@ -142,7 +142,7 @@ def colour_table(anchors: tuple[str, ...], size: int) -> np.ndarray:
 
 
 def coloured(place: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """The colours of positions (H, W) in a table (N, 3), from 0 to 1, to which they are clamped; NaN is magenta."""
+    """The colours at positions (H, W) in a table (N, 3). Positions are clamped to 0 and 1, its ends; NaN is magenta."""
     index = np.rint((len(table) - 1) * np.clip(np.nan_to_num(place, nan=0.0), 0.0, 1.0))
     out = table[index.astype(np.uint8)]
     out[np.isnan(place)] = MAGENTA

@@ -13,7 +13,7 @@ WIDTH = 160  # pixels of the picture
 
 
 def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
-    """HTML with the title, a picture of the first layer (H, W, C), and the least, mean and largest value of each.
+    """HTML with the title, a picture of the first layer (H, W, C), and each layer's least, mean and largest value.
 
     Only finite values count. The last column of the table is the number of pixels with a non-finite value.
     """
@@ -32,7 +32,7 @@ def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
 
 
 def value_range(layer: np.ndarray) -> dict[str, float]:
-    """The least, mean and largest finite value of a layer (H, W, C), NaN without any; and its non-finite pixels."""
+    """The least, mean and largest finite value of a layer (H, W, C), or NaN; and the number of non-finite pixels."""
     finite = np.isfinite(layer)
     values = layer[finite] if finite.any() else np.array([np.nan])
     found = {"min": float(values.min()), "mean": float(values.mean(dtype=np.float64)), "max": float(values.max())}

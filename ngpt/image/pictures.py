@@ -1,4 +1,4 @@
-"""Writes pictures and films of 8-bit sRGB: PNG by ``ngpt.image.png``, JPEG and WebP by Pillow, MP4 by FFmpeg.
+"""Writes pictures and films of 8-bit sRGB: PNG with ``ngpt.image.png``, JPEG and WebP with Pillow, MP4 with FFmpeg.
 
 A film is a lossless animated WebP, or an MP4 (H.264 if FFmpeg has it). FFmpeg is the installed program, or the one in
 the package imageio-ffmpeg.

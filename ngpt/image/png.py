@@ -39,7 +39,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _filtered(image: np.ndarray) -> bytes:
-    """The rows, each with the filter (none, left or up) of the smallest residuals: the PNG standard's heuristic."""
+    """The rows, each with the filter (none, left or up) that gives the smallest residuals, as the standard advises."""
     rows = image.reshape(len(image), -1)
     left, up = rows.copy(), rows.copy()
     left[:, 3:] -= rows[:, :-3]  # uint8 wraps modulo 256, as the standard asks

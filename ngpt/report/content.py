@@ -56,7 +56,7 @@ class Scene:
 
     @property
     def baseline(self) -> ReportEntry:
-        """The entry that the others are compared to."""
+        """The entry that the other entries are compared to."""
         return next((entry for entry in self.entries if entry.name == BASELINE), self.entries[0])
 
     def best(self, metric: str) -> int | None:

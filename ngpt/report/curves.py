@@ -61,9 +61,10 @@ def curves(across: str, lines: Mapping[str, Curve]) -> str:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten from ``low`` to ``high``.
+    """The numbers from ``low`` to ``high`` that are 1, 2 or 5 times a power of ten.
 
-    Over more than 3.5 decades these are only powers of ten. If there are fewer than two, the numbers are evenly spaced.
+    Over more than 3.5 decades, only the powers of ten are returned. If there are fewer than two such numbers, evenly
+    spaced numbers are returned instead.
     """
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     steps = (1, 2, 5) if math.log10(high / low) < 3.5 else (1,)

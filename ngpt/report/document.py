@@ -1,4 +1,4 @@
-"""Pages of text, tables and plots in the style of the report: one file, without scripts, that loads nothing else."""
+"""Makes pages of text, tables and plots in the report's style: single files without scripts that load nothing else."""
 
 import base64
 import hashlib
@@ -31,5 +31,5 @@ def document(title: str, body: str, *, command: str = "", style: str = "", refre
 
 
 def source_hash(body: str) -> str:
-    """The hash of a style or a script for a page's Content-Security-Policy, which allows no other."""
+    """The hash of a style or a script for a page's Content-Security-Policy, which allows no other style or script."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"

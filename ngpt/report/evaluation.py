@@ -20,9 +20,9 @@ ROOM = 54 * 1280 * 720
 def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
     """Writes the report of ``folder``/results.json to ``output`` and returns its path.
 
-    Tables hold all results. Pictures are shown of the first seed, for the lowest sample counts that fit into ROOM; the
-    page says for which ones. A method without a picture is listed with the reason. Raises NgptError if the folder has
-    no readable results, or no result has a picture.
+    Tables hold all results. Pictures are shown only for the first seed, and for the lowest sample counts whose pictures
+    fit into ROOM; the page names these counts. A method without a picture is listed with the reason. Raises NgptError
+    if the folder has no readable results, or no result has a picture.
     """
     folder = Path(folder)
     results = read_results(folder)
@@ -73,7 +73,7 @@ def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
 
 
 def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) -> Scene:
-    """The tab of a scene at a sample count, from its cells: one for each method and seed."""
+    """The tab of a scene at a sample count. ``cells`` has one result for each method and seed."""
     scene = results["scenes"][name]
     entries, absent = [], []
     for method in results["methods"]:
@@ -115,9 +115,9 @@ def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:
 
 
 def _tables(results: dict) -> dict[str, list[list[str]]]:
-    """Tables of the primary metric by methods and sample counts, for the mean and for each scene; and two others.
+    """Tables of the primary metric by methods and sample counts: one of the mean over scenes, and one for each scene.
 
-    The others are the costs of samplers, if there are several, and the absent results with their reasons.
+    Two more tables have the costs of samplers, if there are several samplers, and the absent results with reasons.
     """
     counts = sorted({row["spp"] for row in results["summary"]})
     tables = {}
@@ -142,7 +142,7 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
 
 
 def several_samplers(results: dict) -> bool:
-    """Whether any method has stacks of another sampler than the usual one for its kind of stack."""
+    """Whether the stacks of any method come from a sampler other than the usual one for its kind of stack."""
     return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 
 

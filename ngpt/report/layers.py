@@ -12,7 +12,7 @@ _LIGHT = ("primal", "direct", "caustic", "diffuse", "specular")
 
 
 def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[ReportEntry], dict[str, np.ndarray]]:
-    """The entries and the layers of a ``Scene`` for one file: (H, W, 3) scene-linear; and (H, W, 1) or (H, W, 3).
+    """The entries of a ``Scene`` for one file, (H, W, 3) scene-linear, and its layers, (H, W, 1) or (H, W, 3).
 
     ``shown`` (H, W, 3) is the picture that a viewer shows. It is the first entry, called ``name``. In a result, the
     input follows as "primal". Channels that belong to no colour and no layer of the contract are layers of their own.

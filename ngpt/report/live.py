@@ -95,7 +95,7 @@ class LivePage:
         self.server.server_close()
 
     def answer(self, path: str) -> tuple[str, str] | None:
-        """The content type and the text of the page at ``path``; None if there is none."""
+        """The content type and the text of the page at ``path``; None if there is no such page."""
         if path == "/":
             self._asked = time.monotonic()
             first = {"title": self.title, "line": self.line, "command": self.command}
@@ -120,8 +120,9 @@ def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
 class _Server(ThreadingHTTPServer):
     """Answers each connection in a thread: at most ``MOST`` at once, and each for at most ``_LONGEST`` seconds.
 
-    If there are ``MOST``, a new connection replaces the oldest one, since ordinary requests last some milliseconds. So
-    neither many nor slow connections can block the page, or use up the render's memory and file descriptors.
+    If ``MOST`` connections are open, a new one replaces the oldest. The oldest is hardly an ordinary request, because
+    those last some milliseconds. So neither many nor slow connections can block the page, or use up the render's memory
+    and file descriptors.
     """
 
     daemon_threads = True

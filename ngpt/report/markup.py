@@ -132,7 +132,7 @@ def plain_table(rows: list[list[str]]) -> str:
 
 
 def _compared(value: float, baseline: float, rising: bool) -> str:
-    """The ratio of two errors, or the difference of two values that rise; "" if they are not finite."""
+    """The ratio of two errors, or the difference of two values if higher is better; "" if they are not finite."""
     if not (math.isfinite(value) and math.isfinite(baseline)):
         return ""
     if rising:  # decibels and similarities have no meaningful ratio

@@ -45,9 +45,9 @@ def write_report(
     ``footer``   further facts: versions, device, seed, date
     ``shot``     whether the scenes are the frames of a shot, which the page then plays at one exposure
 
-    Pictures are stored with a relative error of at most 0.14 %. If the page would exceed PAGE_LIMIT bytes, they are
-    stored more coarsely, the noisiest first. The page states the largest error of each picture. Raises NgptError for
-    scenes without pictures, and for images of different sizes or equal names in a scene.
+    Pictures are stored with a relative error of at most 0.14 %. If the page would exceed PAGE_LIMIT bytes, some
+    pictures are stored more coarsely, beginning with the noisiest. The page states the largest error of each picture.
+    Raises NgptError for scenes without pictures, and for images of different sizes or equal names in a scene.
     """
     path = Path(path)
     if not scenes:
@@ -115,7 +115,7 @@ def page_text(
 
 
 def _printable(value: Any) -> Any:
-    """The value with all texts made printable, as in the markup, in which the script looks names up."""
+    """The value with all texts made printable, as they are in the markup: the script searches it for these names."""
     if isinstance(value, dict):
         return {printable(key): _printable(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

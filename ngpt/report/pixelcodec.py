@@ -56,7 +56,7 @@ def encode(image: np.ndarray, steps: int) -> bytes:
 
 
 def _guesses(plane: np.ndarray) -> list[np.ndarray]:
-    """Two predictions of each number, int16, by the median and the mean of neighbours.
+    """Two predictions of each number, int16: one from the median of its neighbours, and one from their mean.
 
     Neighbours above the first row are 0; those beyond the sides are equal to the nearest number of the row above.
     """
@@ -74,8 +74,9 @@ def _guesses(plane: np.ndarray) -> list[np.ndarray]:
 def fitting_steps(images: list[np.ndarray], room: float) -> list[int]:
     """Steps per stop for each of the exposed ``images``, so that all of them, encoded, take about ``room`` bytes.
 
-    The largest encoded image is made coarser first, because it is the noisiest, and noise hides the loss best. Sizes
-    are estimated from an eighth of the rows. With the coarsest steps for all images, the result may exceed ``room``.
+    The largest encoded image is made coarser first, because it is the noisiest, and noise hides the loss best. Sizes of
+    large images are estimated from an eighth of the rows. If all images have the coarsest steps, the result may still
+    exceed ``room``.
     """
     places = [0] * len(images)
     sizes = [_estimate(image, LADDER[0]) for image in images]

@@ -66,6 +66,6 @@ def preview(stack: GradientStack) -> Preview:
 
 
 def _place(variance: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Variances (H, W, 3) over squared radiance (H, W), as values from 0 to 1 (H, W) on the scale of errors."""
+    """Divides variances (H, W, 3) by squared radiance (H, W), and returns positions (H, W) from 0 to 1 for a map."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.clip((np.log10(np.nan_to_num(variance).mean(axis=-1) / unit) - _LOW) / (_HIGH - _LOW), 0, 1)

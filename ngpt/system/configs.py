@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError, did_you_mean
 
-# Inside the package if it is installed, and beside it in the repository
+# The configurations are inside the package if it is installed, and beside the package in the repository.
 _PACKAGE = Path(__file__).parents[1]
 FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if f.is_dir()), _PACKAGE / "configs")
 

@@ -23,8 +23,9 @@ from ngpt.system.text import printable
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
-# The columns of a terminal that a bar takes beside its label: in the wide form, for a rate in addition, and in the
-# narrow form, which has only numbers and the time left. It is used if fewer than LABEL columns remain for the label.
+# The columns of a terminal that a bar takes beside its label: WIDE in the wide form, RATE more if it shows a rate, and
+# NARROW in the narrow form, which has only numbers and the time left. The narrow form is used if fewer than LABEL
+# columns remain for the label.
 WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
 # The least address space that ngpt needs, in MiB
@@ -45,7 +46,7 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
             try:
                 return run()
             finally:
-                # Flushed here, because at its end Python would report an error in its own way.
+                # The output is flushed here, because Python would report an error at its exit in its own way.
                 sys.stdout.flush()
         except SystemExit:
             raise
@@ -91,7 +92,7 @@ def print_line(text: str, stream: TextIO) -> None:
     try:
         print(printable(text), file=stream, flush=True)
     except RuntimeError:
-        # This is a signal handler that interrupted another line, and the buffer is not reentrant.
+        # A signal handler prints this line. It has interrupted another print, and the buffer is not reentrant.
         os.write(stream.fileno(), f"{printable(text)}\n".encode(errors="backslashreplace"))
     except OSError:
         _close(stream)
@@ -105,7 +106,7 @@ def _close(stream: TextIO) -> None:
 
 
 def _open_standard_streams() -> None:
-    """Opens standard streams that are closed. Otherwise an opened file would get their number, and the printed text."""
+    """Opens standard streams that are closed. A file opened later would get their number, and what is printed."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -184,7 +185,7 @@ class Console:
     def progress(
         self, label: str, unit: str, rate: bool = False, begins: str = ""
     ) -> Iterator[Callable[[int, int], None]]:
-        """Yields ``update(done, total)``. Its first call starts the clock; ``done`` is then the work of earlier runs.
+        """Yields ``update(done, total)``. Its first call starts the clock and counts ``done`` as work of earlier runs.
 
         ``rate`` is whether units per second are shown. ``begins`` is a phrase that is shown until the second call.
         """
@@ -198,7 +199,7 @@ class Console:
 
 
 class _Pace:
-    """Estimates the time left from the pace in the later half of the elapsed time: cached units soon stop counting."""
+    """Estimates the time left from the pace in the later half of the elapsed time, where cached units soon drop out."""
 
     def __init__(self, unit: str, rate: bool, begins: str):
         self.unit, self.rate, self.begins = unit, rate, begins

@@ -67,8 +67,8 @@ def save(
     ("a.kept.exr" for "a.exr"), the working directory, and the folder for temporary files. Nothing is overwritten there.
     ``write`` must write a complete file or none, as ``atomic_output`` does.
 
-    ``alike`` means that several processes write the same file to this folder, in which each file counts. Then an
-    existing file is accepted, and no file is put beside it.
+    ``alike`` means that several processes write the same file to this folder, and that every file in the folder counts
+    as data. Then a file that exists at ``path`` by now is accepted, and no file is put beside ``path``.
     """
     path = Path(path)
     try:
@@ -116,7 +116,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         yield temporary
         with open(temporary, "r+b") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
-        # mkstemp makes private files, and open() would not.
+        # mkstemp makes private files. This file gets the permissions that open() would have given it.
         os.chmod(temporary, 0o666 & ~_umask())
         _publish(temporary, path, overwrite)
         _sync_folder(path.parent)
@@ -152,7 +152,7 @@ def _temporary(path: Path) -> tuple[Path, int | None]:
             fcntl.flock(handle, fcntl.LOCK_EX)
         if os.path.exists(name):
             return Path(name), handle
-        # Another process removed it before it was locked.
+        # Another process removed the file before it was locked.
         os.close(handle)
 
 

@@ -15,7 +15,7 @@ Made = TypeVar("Made")
 
 
 def hold_while_forking(lock: Lock, drop: Callable[[], object] = lambda: None) -> None:
-    """Makes each fork wait until no other thread holds ``lock``, and calls ``drop`` before it, with the lock held.
+    """Makes each fork wait until no other thread holds ``lock``. Before the fork, calls ``drop`` with the lock held.
 
     The thread that forks must not hold the lock.
     """

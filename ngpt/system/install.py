@@ -11,7 +11,7 @@ from pathlib import Path
 PUBLISHED = False
 
 NAME, STUDIES = "ngpt-recon", "ngpt-studies"
-# The entries of registries that ngpt-studies adds, by the word of the registry for an entry
+# The entries that ngpt-studies adds to registries. Keys are the words of registries for an entry, such as "sampler".
 _PHOTONS = ("beams", "gbeams", "gbre", "gplanes", "gpm", "gvcm", "gvpm", "planes", "vpm")
 _SAMPLERS = ("gbdpt", "gmlt", "gpt-tiles", "restir", "split", *_PHOTONS)
 BROUGHT = {"method": ("nlm",), "network": ("kpcn",), "sampler": _SAMPLERS}
@@ -24,7 +24,7 @@ def install_command(extra: str) -> str:
         return f"{_pip()} install '{NAME}[{extra}]'"
     if (CHECKOUT / "pyproject.toml").is_file():
         return f"{_pip()} install -e {shlex.quote(f'{CHECKOUT}[{extra}]')}"
-    # The file of the installed wheel may be gone by now.
+    # The packages are named one by one, because the file of the installed wheel may be gone by now.
     return f"{_pip()} install {shlex.join(packages_of(extra))}"
 
 

@@ -12,7 +12,7 @@ _SIGNALS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SI
 
 
 class Interrupt:
-    """Records the number of the first signal, 0 if none has arrived. A call returns whether one has arrived."""
+    """Records the number of the first signal; 0 if none has arrived. A call returns whether a signal has arrived."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -38,7 +38,7 @@ def raised() -> Iterator[Interrupt]:
         found.signal = found.signal or number
         raise Interrupted
 
-    # Other code has set a handler if it is not Python's default. In background jobs of a script, SIGINT is ignored.
+    # A handler that is not Python's default was set by other code. In background jobs of a script, SIGINT is ignored.
     free = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
     with _handled(free, note):
         yield found
@@ -46,7 +46,7 @@ def raised() -> Iterator[Interrupt]:
 
 @contextmanager
 def noted(notify: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
-    """In the block, the first signal is only recorded, and ``notify`` is called. A second one has its usual effect.
+    """In the block, the first signal is only recorded, and ``notify`` is called. A second signal acts as usual.
 
     Ignored signals stay ignored. Outside of the main thread, nothing is changed.
     """
@@ -66,7 +66,7 @@ def noted(notify: Callable[[], None] = lambda: None) -> Iterator[Interrupt]:
 
 @contextmanager
 def _handled(numbers: Sequence[int], handler: Callable) -> Iterator[None]:
-    """Sets a handler for these signals in the block. Does nothing outside of the main thread, where none arrive."""
+    """Sets a handler for these signals in the block. Does nothing outside of the main thread, where none arrives."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -53,7 +53,7 @@ def _quota() -> int | None:
 def _of_groups(name: str, controller: str) -> list[str]:
     """The contents of the files ``name`` in the control group of this process and in all groups above it.
 
-    ``controller``  a controller of cgroup version 1, which has a tree for each; "" for version 2
+    ``controller``  a controller of cgroup version 1, which has a tree of groups for each controller; "" for version 2
     """
     try:
         lines = [line.split(":", 2) for line in _OWN_GROUPS.read_text(encoding="utf-8", errors="replace").splitlines()]
@@ -87,7 +87,7 @@ def limited() -> bool:
 
 
 def memory() -> int:
-    """Bytes of memory that this process may use: the least of the machine's, the container's and its own limit."""
+    """Bytes that this process may use: the least of the machine's memory, the container's limit and its own limit."""
     texts = _of_groups("memory.max", "") + _of_groups("memory.limit_in_bytes", "memory")
     limits = [int(text) for text in texts if text.isdecimal()]
     own = address_space()
@@ -99,7 +99,7 @@ def _physical() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     kibibytes = ctypes.c_ulonglong()
     with suppress(AttributeError):  # neither POSIX nor Windows
-        # It sets nothing on virtual machines without the firmware tables of a real machine.
+        # This call sets nothing on virtual machines without the firmware tables of a real machine.
         ctypes.windll.kernel32.GetPhysicallyInstalledSystemMemory(ctypes.byref(kibibytes))  # type: ignore[attr-defined]
     return kibibytes.value * 1024 or _ASSUMED
 

@@ -37,7 +37,7 @@ def points(group: str) -> Iterator[Any]:
 
 @cache
 def _listed(path: tuple[str, ...]) -> Any:
-    """The entry points of all packages on the ``path``. A list takes 5 ms, and a command needs several groups."""
+    """The entry points of all packages on the ``path``. They are cached, because listing them takes 5 ms."""
     from importlib.metadata import entry_points  # takes 50 ms
 
     return entry_points()

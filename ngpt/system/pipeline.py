@@ -52,7 +52,8 @@ def overlapped(
 def _begun(thread: ThreadPoolExecutor, stage: Callable[[Any], Any], value: Any) -> SimpleQueue:
     """Begins a stage in a thread. Its result or error will be in the returned queue.
 
-    A future is not used: an interrupt during a wait for it may leave its lock held, so that the thread waits forever.
+    A future is not used. If an interrupt comes during a wait for a future, the future's lock may stay held, and the
+    thread waits forever.
     """
     outcome: SimpleQueue = SimpleQueue()
     thread.submit(lambda: outcome.put(_attempt(stage, value)))

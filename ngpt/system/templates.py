@@ -32,7 +32,7 @@ def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
 def template(
     text: str, tables: Mapping[str, type | None], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}
 ) -> str:
-    """The configuration ``text``, with the meaning and the default of each parameter that it does not set as comments.
+    """Adds comments to the configuration ``text``: the meaning and the default of each parameter that it does not set.
 
     ``tables``  the dataclass of each table, by its name; "" is the top level, and None stands for a table without
                 comments
@@ -58,7 +58,7 @@ def template(
 
 
 def _commented(kind: type, given: set[str], others: Mapping[str, tuple[str, Any]]) -> str:
-    """Comments for the parameters of a dataclass, and for ``others``, that are not ``given``."""
+    """Comments for those parameters of a dataclass, and of ``others``, that are not ``given``."""
     meanings = entries(kind)
     explained = {name for names, _ in meanings for name in names}
     known = [field for field in fields(kind) if not field.metadata.get("internal")]

@@ -19,7 +19,7 @@ _names: dict[str, str] = {}
 
 @contextmanager
 def called(path: str, name: str) -> Iterator[None]:
-    """In the block, and in errors that leave it, messages and results call the file ``path`` ``name``."""
+    """In the block, messages and results give the file ``path`` this ``name``. So do errors that leave the block."""
     _names[path] = name
     try:
         yield

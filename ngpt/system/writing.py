@@ -17,7 +17,7 @@ def write_bytes(path: str | Path, data: bytes, overwrite: bool = True) -> None:
 
 
 def write_text(path: Path, text: str, overwrite: bool = True) -> None:
-    """Writes ``text`` in UTF-8, with its own line ends on all systems, as ``write_bytes`` does."""
+    """Writes ``text`` in UTF-8, as ``write_bytes`` does. Its line ends are not changed, on any system."""
     write_bytes(path, text.encode(), overwrite)
 
 
