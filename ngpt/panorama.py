@@ -28,7 +28,7 @@ def wrapping(stack: GradientStack) -> GradientStack:
 
 
 def continued(stack: GradientStack) -> GradientStack:
-    """Returns a panorama (H, W) as a plain stack (H, W + 2 MARGIN): beside each border, it has columns from the other.
+    """Returns a panorama (H, W) as a plain stack (H, W + 2 MARGIN), where each border is continued by the other side.
 
     Differences between the last column and the first are not known, and become NaN.
     """

@@ -23,8 +23,8 @@ from ngpt.system.late import ndimage
 
 SPREAD = 2.6  # standard deviation, in pixels, of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
-# Measured by bench/uncertainty.py of commit e61ee6f3 on the scenes named there. FACTOR, the most frequent one, is for
-# all other methods.
+# Factors that bench/uncertainty.py of commit e61ee6f3 measured on the scenes named there. FACTOR, the most frequent
+# value, is for all other methods.
 FACTORS = {"primal": 0.9, "l2": 0.9, "l1": 1.7, "cv": 0.85, "wcv": 1.1, "wl2": 1.4}
 FACTOR = 1.2
 

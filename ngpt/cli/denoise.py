@@ -184,7 +184,10 @@ def results(request: DenoiseRequest, console: Console) -> Any:
 
 
 def read_frame(pair: tuple[Path, Path], request: DenoiseRequest, again: Container[Path]) -> Frame:
-    """Reads a frame. A frame whose result exists is read only if the result is in ``again``: other frames need it."""
+    """Reads a frame.
+
+    If the result of the frame exists, the frame is only read if ``again`` has the result: then other frames need it.
+    """
     source, target = pair
     # Whether the result exists is checked only now, because several machines may work on one folder.
     exists = request.skip_existing and finished(target)

@@ -70,9 +70,10 @@ def frame_name(path: Path) -> str:
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """Files in the order of their frames: by the attribute ``ngpt:frame`` if all differ in it, else by their names.
+    """Files in the order of their frames: by the attribute ``ngpt:frame`` if all files have it and differ in it.
 
-    If the names differ in more than one number, the files form several series, which follow one another.
+    Otherwise, files whose names differ in only one number form a series, and the series follow one another. In a
+    series, files are in the order of the attribute if all have it, and otherwise in the order of their names.
     """
     given = list(files)
     frames = {path: frame for path in given if (frame := _frame(path)) is not None} if len(given) > 1 else {}

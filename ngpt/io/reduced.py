@@ -59,7 +59,7 @@ def reduced_place(place: Place, k: int) -> Place:
 
 
 def cut_pixels(place: Place, k: int) -> str:
-    """A message about rows and columns that are left out, since a window is no multiple of K; "" if none are."""
+    """A message about rows and columns that are left out because no whole block of K has them; "" if none are."""
     lines: list[str] = []
     for name, window in (("data", place.data), ("display", place.display)):
         small = reduced_window(window, k)

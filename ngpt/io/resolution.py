@@ -193,7 +193,7 @@ def holds_colour(parts: Parts) -> bool:
 
 
 def _group(parts: Parts) -> list[_Group]:
-    """The channels by layers. A channel without a dot also is a layer of its own, with the channel's name."""
+    """Groups the channels by layers. A channel without a dot is also a layer of its own, with the channel's name."""
     filled = [index for index, (_, channels) in enumerate(parts) if channels]
     several = len(filled) > 1
     groups: dict[tuple[int, str], dict[str, str]] = {}

@@ -17,7 +17,7 @@ from typing import NamedTuple
 from ngpt.errors import NgptError
 from ngpt.io.resolution import holds_colour
 
-# Views that are recognised without an attribute if both have the same channels
+# Views that are recognised without an attribute (see ``_eyes``)
 _EYES = ("left", "right")
 
 
@@ -83,7 +83,7 @@ def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[V
 
 
 def _eyes(parts: Sequence[Part]) -> list[str]:
-    """("left", "right") if each has a part of its own, or if both have the same channel; otherwise none."""
+    """Left and right, if each of them has a part of its own, or if they have a channel in common; otherwise none."""
     left, right = _EYES
     if {left, right} <= {part.name for part in parts}:
         return list(_EYES)

@@ -73,7 +73,7 @@ class LivePage:
         return time.monotonic() - self._asked < _GONE
 
     def show(self, preview: Preview, caption: str) -> None:
-        """Replaces the images of the page. All are shown at the exposure of the first preview."""
+        """Replaces the images of the page. All previews are shown at the exposure of the first preview."""
         scene = preview.scene("newest", caption)
         if self.exposure is None:
             self.exposure = auto_exposure(scene)

@@ -106,7 +106,10 @@ def _close(stream: TextIO) -> None:
 
 
 def _open_standard_streams() -> None:
-    """Opens standard streams that are closed. A file opened later would get their number, and what is printed."""
+    """Opens standard streams that are closed.
+
+    If a stream stayed closed, a file opened later would get its number, and printed text would go into that file.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)

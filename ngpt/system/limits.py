@@ -63,7 +63,7 @@ def _of_groups(name: str, controller: str) -> list[str]:
     if own is None:
         return []
     root = _GROUPS / controller
-    # In a container, the path may be the host's; then only the root exists.
+    # In a container, the path may be that of the host, which the container lacks. Then only the root exists.
     folders = [root / own.strip("/"), *(root / own.strip("/")).parents]
     files = [folder / name for folder in folders if folder == root or root in folder.parents]
     return [file.read_text(encoding="ascii").strip() for file in files if file.is_file()]

@@ -22,7 +22,7 @@ def regular_file(path: Path) -> Iterator[BinaryIO]:
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if os.path.isdir(path):  # not every system's error tells
+        if os.path.isdir(path):  # not every system's error says so
             raise NgptError(f"{path}: is a directory; name a file in it") from None
         raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
     with file:

@@ -56,7 +56,7 @@ def check(value: Any, shape: Shape, where: str) -> None:
             check(value[name], shape[str] if str in shape else shape[name], f"{where}: '{name}'")
     else:
         kinds = shape if isinstance(shape, tuple) else (shape,)
-        # To Python, true is a number.
+        # In Python, True counts as a number.
         right = isinstance(value, kinds) and (not isinstance(value, bool) or bool in kinds)
         in_range = not isinstance(value, int) or abs(value) < 2**63
         _demand(right and in_range, value, " or ".join(kind.__name__ for kind in kinds), where)
@@ -124,7 +124,7 @@ def _converted(value: Any, hint: Any, where: str) -> Any:
         return tuple(_converted(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(value, kinds, strict=True)))
     if get_origin(hint) is dict and isinstance(value, dict):
         return {name: _converted(item, kinds[1], f"{where}: [{name}]") for name, item in value.items()}
-    # To Python, true is a number.
+    # In Python, True counts as a number.
     if isinstance(value, bool) and hint is not bool:
         raise _OtherType
     right = (int, float) if hint is float else get_origin(hint) or hint
