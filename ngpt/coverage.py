@@ -5,7 +5,7 @@ light, and dark pixels among them, are not changed.
 
 Light that a method spreads into empty pixels is missing in covered pixels. Hair, for example, may cover a tenth of each
 pixel. Then few samples hit the hair, and a method blurs it. Therefore the light in empty pixels is given back to the
-covered pixels around them, in proportion to their alpha, but only as much as the result has less light than the input.
+covered pixels around them, in proportion to their alpha, but no more than the method took from these pixels.
 """
 
 import numpy as np

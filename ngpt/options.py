@@ -17,7 +17,7 @@ _ANY = (-math.inf, math.inf)
 
 @dataclass(frozen=True)
 class Option:
-    """An option. Its values have the type of its ``default``, or are numbers if a text as default has a ``range``.
+    """An option. Values have the type of the ``default``. If that is a text and there is a ``range``, numbers fit too.
 
     ``meaning``  one line for the user
     ``choices``  the allowed values; () for any

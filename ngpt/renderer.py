@@ -35,7 +35,7 @@ class Renderer(Protocol):
     def measure(
         self, scene: Any, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
     ) -> tuple[dict[str, list[float]], GradientStack]:
-        """Measures the seconds per sample of each of the named ``renders``. Also returns the first one's last stack."""
+        """The seconds per sample of each of the named ``renders``, and the last stack of the first of these renders."""
 
     def batch(self, sampler: str) -> int:
         """The number of samples per pixel in a group of dependent samples; 0 if all samples are independent."""
