@@ -1,9 +1,10 @@
 """Adaptive samples: a few samples everywhere first, then more of them where the result's error is large.
 
 Before each step the chosen method reconstructs the image twice, which gives the standard error of its result
-(``ngpt.api.uncertainty``). docs/use/adaptive.md says how the samples of a step follow from it. The samples that decide
-the counts stay in the means. So a pixel whose first samples were too dark by chance might get too few samples. This
-bias is small, because errors are means over about 9x9 pixels, relative to the light there.
+(``ngpt.api.uncertainty``). docs/use/adaptive.md says how the numbers of samples follow from this error. The samples
+that decide these numbers are also part of the image. So a pixel whose first samples were too dark by chance might get
+too few further samples, and stay too dark. This bias is small, because the errors are divided by the light and averaged
+over about 9x9 pixels.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import cropped, subpixels
 from ngpt.system.late import ndimage
 
-# Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
+# Samples of a pixel come in blocks. A block is as large as a packet, the rays that are traced together. So the bits of
+# a pixel do not depend on which other pixels are rendered.
 BLOCK = PACKET
-# Least mean number of samples per pixel: the first step everywhere, and as many again to distribute
+# The least mean number of samples per pixel: the first step gives BLOCK samples to each pixel, and as many more are
+# left to distribute
 LEAST = 2 * BLOCK
 # The fewest and the most samples that a pixel gets, relative to an even share
 _FLOOR, _CAP = 0.25, 16.0
@@ -47,8 +50,8 @@ _TRIM = 0.001
 # would get more samples.
 _CUT = 0.03
 # The error of an image relative to the root mean square of its standard errors. It is above 1, since a few errors are
-# much larger than their standard errors. For l1 it is below 1, since its standard errors include light that it leaves
-# out. Measured by bench/adaptive.py of commit e61ee6f3 in six scenes.
+# much larger than their standard errors. For the method l1 it is below 1, since the standard errors of l1 include light
+# that l1 leaves out of the image. Measured by bench/adaptive.py of commit e61ee6f3 in six scenes.
 _TAILS, _TAIL = {"l1": 0.75}, 1.25
 # Side, in pixels, of the part of an image that the method is timed on
 _PART = 96
@@ -59,15 +62,16 @@ class Adaptive:
     """How samples are distributed.
 
     The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
-    pixels, for the result x of the ``method`` and the converged image r, as far as standard errors foretell it.
+    pixels, for the result x of the ``method`` and the converged image r. It is estimated from standard errors, since r
+    is not known.
     """
 
     error: float | None = None  # the render ends at this error; None: samples or time end it
     method: str = "auto"
 
     def chosen_by(self, stack: GradientStack) -> str:
-        """The method whose errors decide where samples go. If no method is named and no error must be foretold, it is
-        ``wcv`` for a stack with gradients: networks take many times as long, and have their errors in about the same
+        """The method whose errors decide where samples go. If neither a method nor an error is requested, it is ``wcv``
+        for a stack with gradients. Networks take many times as long as ``wcv``, and their errors are in about the same
         places."""
         return "wcv" if self.method == "auto" and self.error is None and "dx" in stack else self.method
 
@@ -92,8 +96,9 @@ def render_adaptive(
     """Renders adaptive samples. Returns the film, and the attributes with the method and the error.
 
     For the parameters see ``data_gen.passes.render_passes()``. The samples of the ``budget`` and of the progress are
-    means over pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and the
-    number of all samples decide the bits, whatever ended the render. Raises NgptError as the method does.
+    means over pixels. The first 16 samples of each pixel are always rendered. The bits of the result depend on the
+    seed, the size, the method and the total number of samples, but not on what ended the render. Raises NgptError as
+    the method does.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     pixels = width * height
@@ -178,7 +183,7 @@ def seconds_to_assess(stack: GradientStack, method: str, clock: Callable[[], flo
     if stack.width * stack.height < 4 * _PART**2:
         return 0.0
     seconds = 0.0
-    for side in (_PART // 4, _PART):  # The first time, networks are loaded.
+    for side in (_PART // 4, _PART):  # The first call loads networks, so its time is discarded.
         rows, columns = (slice(max(0, (n - side) // 2), (n + side) // 2) for n in (stack.height, stack.width))
         fine = stack.fine and cropped(stack.fine, (rows, columns), subpixels(stack.fine, stack.width))
         layers = {name: stack[name][rows, columns] for name in stack.names}
@@ -203,8 +208,8 @@ def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
 
 
 def gain(need: np.ndarray) -> float:
-    """The expected squared error relative to as many even samples, if ``need`` (pixels) is right and the numbers of
-    samples follow it exactly."""
+    """The expected squared error with adaptive samples, divided by that with the same number of even samples, if
+    ``need`` (pixels) is right and the numbers of samples follow it exactly."""
     shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
     squares = np.square(need)
     return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))
@@ -215,10 +220,11 @@ class UnevenRender:
 
     The steps make one sequence of blocks: the first block of all pixels that get one, row by row, then the second block
     of all pixels that get two, and so on. ``most`` samples, the time of the ``budget`` or ``stop`` can end the sequence
-    anywhere. The same total of samples gives the same bits, whatever the passes and whatever ended the render.
+    anywhere. The same total of samples gives the same bits, however the sequence is divided into passes and whatever
+    ended the render.
 
-    ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it. ``stop`` is
-    called before each pass, and ``report`` after it.
+    The samples that ``sample`` takes must not share anything; for ``sample`` see ``data_gen.passes.render_passes()``.
+    ``stop`` is called before each pass, and ``report`` after it.
     """
 
     def __init__(
@@ -249,7 +255,8 @@ class UnevenRender:
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
         self.rounds, self.done = rounds_of(sample), 0
-        # The first block has the samples of several rounds of an even render. So all these rounds begin before it.
+        # The first block of a pixel has samples that an even render takes in several rounds. So all these rounds begin
+        # before this block.
         for first in (0, BLOCK - 1):
             self.rounds.begin(sensor, seed, first, self.film)
 
@@ -275,7 +282,8 @@ class UnevenRender:
             self.report()
 
     def _of_round(self) -> int:
-        """The blocks up to the end of the current round. Rounds are counted in samples of all pixels."""
+        """The number of blocks up to the end of the current round. A round ends at a given mean number of samples per
+        pixel."""
         end = self.rounds.end_of_round(self.done // self.film.pixels)
         return 1 << 62 if end is None else max(1, -(-(end * self.film.pixels - self.done) // BLOCK))
 
@@ -289,13 +297,14 @@ class UnevenRender:
         if whole or self.end is None:
             return n
         left = self.end - self.clock()
-        # Two thirds of the time left, since a pass may take longer than others did, or all of it if that is too little.
+        # A pass may take longer than earlier passes, so it is planned to take two thirds of the time left. If this is
+        # too short for a block, the pass has one block if that fits into all of the time left.
         most = int((2 / 3 * left - begin) / each)
         return min(n, most if most > 0 else int(left > begin + each))
 
     def _render(self, some: np.ndarray) -> None:
-        """Renders one block of each of ``some`` pixels, in ascending order. A pixel that is listed several times gets
-        as many blocks.
+        """Renders one block for each entry of ``some``, a list of pixels in ascending order. A pixel that is listed n
+        times gets n blocks.
         """
         start = self.clock()
         pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)

@@ -1,7 +1,8 @@
 """Unfinished renders: whether a file has all that was requested, and what is left to render.
 
-The rest gets its own seed, made from the requested seed and the number of existing parts. So its samples are
-independent of those in the file, and parts are merged exactly as stacks with different seeds are (``ngpt.merging``).
+What is left (the rest) gets its own seed, derived from the requested seed and the number of parts that exist. So the
+samples of the rest are independent of those in the file, and the two are merged like any stacks with different seeds
+(``ngpt.merging``).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ SHARED = 32
 
 def frame_seed(seed: int, frame: int, use: int = 0) -> int:
     """The seed of a frame, which depends on no other frame. Each ``use`` of the frame has another seed."""
-    # Entropy must not be negative, frames may be.
+    # Entropy must not be negative, but the number of a frame may be.
     entropy = [seed, frame % 2**64]
     return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
 
@@ -45,7 +46,7 @@ def part_seed(seed: int, part: int) -> int:
 
 
 class Unfinished(NgptError):
-    """A failure during a render, with the ``stack`` of the samples that were done before."""
+    """A failure during a render. ``stack`` holds the samples that were rendered before it."""
 
     def __init__(self, message: str, stack: GradientStack):
         super().__init__(message)
@@ -57,8 +58,8 @@ def rest_of(
 ) -> RenderRequest | None:
     """The part of a request that its file still lacks, for an image or for a ``frame``; None if it lacks nothing.
 
-    ``attributes`` are from the header of the file at ``path``. The sampler of the rest is the file's, and its seed is
-    the one for the next part. Raises NgptError if the file belongs to another request.
+    ``attributes`` are from the header of the file at ``path``. The rest is rendered by the sampler that the header
+    names, with the seed of the next part. Raises NgptError if the file belongs to another request.
     """
     said = _same(request, path, attributes, frame)
     seeds, sampler = str(attributes.get("ngpt:seed", "")).split(), str(attributes.get("ngpt:sampler", ""))
@@ -69,7 +70,7 @@ def rest_of(
     if request.seconds is not None and given >= (1 - _NOTHING) * request.seconds:
         return None
     reached = _number(attributes.get("ngpt:error")) or math.inf
-    if request.error is not None and reached <= (1 + 1e-6) * request.error:  # headers have 32 bits
+    if request.error is not None and reached <= (1 + 1e-6) * request.error:  # headers store 32-bit floats
         return None
     if sampler in FRAME_SAMPLERS:
         raise NgptError(
@@ -97,7 +98,7 @@ def rest_of(
 
 
 def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], frame: int | None) -> dict[str, Any]:
-    """The request in the header of a file. Raises NgptError if it differs from this one in more than the budget."""
+    """The request in the header of a file. Raises NgptError if it differs from ``request`` in more than the budget."""
     said = said_by(attributes)
     remedy = "give another name, or --force in place of --skip-existing to replace it"
     for what, given in {"scene": request.scene, "camera": request.camera}.items():
@@ -112,7 +113,7 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
         )
     for what, ours in request.identity(frame).items():
         if (theirs := said.get(what)) != ours:
-            # Scenes of the same name differ in the checksum, which tells a user nothing.
+            # If two scenes have the same name, they differ only in the checksum, which tells a user nothing.
             alike = what == "scene" and str(theirs).rpartition(" ")[0] == str(ours).rpartition(" ")[0]
             why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
             raise NgptError(
@@ -122,7 +123,7 @@ def _same(request: RenderRequest, path: Path, attributes: Mapping[str, Any], fra
 
 
 def begun_stack(path: Path) -> GradientStack:
-    """The stack in a file, without the image that a method may have made of it."""
+    """The stack in a file, without the image that a method may have made from this stack."""
     found = read(path)
     layers = {name: found[name] for name in found.names if name != "error"}
     attributes = {name: value for name, value in found.attributes.items() if name not in MADE_BY}
@@ -132,9 +133,9 @@ def begun_stack(path: Path) -> GradientStack:
 
 
 def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
-    """Both parts merged; the attributes that say how the render ended come from ``rest``.
+    """Merges both parts of a render. The attributes that say how the render ended come from ``rest``.
 
-    If they cannot be merged, the rest is written to another file beside ``path``, and NgptError names that file.
+    If the parts cannot be merged, the rest is written to another file beside ``path``, and NgptError names that file.
     """
     try:
         whole = merge([begun, rest])
@@ -142,7 +143,7 @@ def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> Gra
         raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
     last = (UNFINISHED, REQUEST, "ngpt:adaptive")
     whole.attributes |= {name: rest.attributes[name] for name in last if name in rest.attributes}
-    # Errors fall with the root of the samples.
+    # Errors are proportional to 1 / sqrt(samples), so the 1 / error² of the parts add up.
     errors = [n for stack in (begun, rest) if (n := _number(stack.attributes.get("ngpt:error")))]
     if errors:
         whole.attributes["ngpt:error"] = 1 / math.sqrt(sum(n**-2 for n in errors))
@@ -150,7 +151,8 @@ def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> Gra
 
 
 def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
-    """Writes a stack to ``path``, or elsewhere, after a failure. Returns an error that says ``why``, with the file."""
+    """Writes a stack to ``path``, or elsewhere, after a failure. Returns an error whose message contains ``why`` and
+    the name of that file."""
     try:
         save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite))
     except NgptError as other:

@@ -12,10 +12,12 @@ from ngpt.stack import GradientStack
 
 # The default memory limit of a render in MiB, without the scene itself
 DEFAULT_MEMORY = 6144
-# Bytes that a lane takes in a pass. Path tracers were measured to take at most 200; the rest is a margin.
+# Bytes that a lane (one camera sample) takes in a pass. Path tracers were measured to take at most 200; the rest is a
+# margin.
 LANE_BYTES = 256
 
-# Called with (samples per pixel so far, spp), or in renders with a time limit with (elapsed seconds, limit), both whole
+# Called with (samples per pixel so far, spp). In renders with a time limit, called with (elapsed seconds, limit), both
+# whole numbers.
 Progress = Callable[[int, int], None]
 
 

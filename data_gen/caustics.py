@@ -1,10 +1,9 @@
-"""Measures how much of a scene's light paths from the camera hardly find: caustics of lamps that are tiny or have no
-size.
+"""Measures which share of a scene's light is caustics of lamps that are tiny or have no size.
 
 Light paths are connected to the camera at each of their vertices. A path counts as a caustic if it starts at such a
-lamp and meets a mirror or clear glass before any other surface. From behind that mirror or glass, no connection leads
-to the lamp, and few paths hit the lamp by chance. Light that the camera sees only in mirrors or through glass is not
-measured.
+lamp and meets a mirror or clear glass before any other surface. Paths from the camera hardly find such caustics: no
+connection leads through the mirror or glass to the lamp, and few paths hit the lamp by chance. Light that the camera
+sees only in mirrors or through glass is not measured.
 """
 
 from __future__ import annotations
@@ -37,7 +36,8 @@ def share_of_caustics(scene: mi.Scene) -> float | None:
     """The share of caustics in the light on the surfaces that the camera sees, 0 to 1; None if ``bdpt`` cannot render
     the scene.
 
-    It is 0 in scenes without tiny lamps, and without mirrors and clear glass. The random numbers are always the same.
+    The share is 0 in scenes that have no tiny lamps, or neither mirrors nor clear glass. The measurement always uses
+    the same random numbers.
     """
     if not behind_sharp(scene):
         return 0.0
@@ -57,7 +57,8 @@ def share_of_caustics(scene: mi.Scene) -> float | None:
 
 @dr.syntax
 def _light(plan: Plan, sight: Sight, table: mi.Bool) -> tuple[mi.Float, mi.Float]:
-    """The caustic light that each light path brings to the camera, and all light that it brings.
+    """Returns two values for each light path: the caustic light that it brings to the camera, and all light that it
+    brings.
 
     ``table`` says for each emitter of the scene whether it is tiny or has no size.
     """

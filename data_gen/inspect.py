@@ -126,8 +126,8 @@ def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
 
 
 def _transport(nodes: Sequence) -> tuple[str, str, str, bool]:
-    """The plugin of a scene's integrator, the plugin whose image is rendered instead, why that is impossible or "", and
-    whether lamps are hidden from the camera."""
+    """Returns the plugin of a scene's integrator, the plugin whose image is rendered instead, the reason why this is
+    impossible (or ""), and whether lamps are hidden from the camera."""
     found = _children(nodes, nodes[0], mi.ObjectType.Integrator)
     if not found:
         return "path", "path", "", False
@@ -197,7 +197,8 @@ def _of_tiny_lamps(plugins: dict[str, Counter], facts: Facts) -> list[str]:
 def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
     """The arguments ``--sampler NAME`` of all samplers that can render the scene and find this kind of ``light``.
 
-    Studies are left out. ``and_hidden_lamps`` says whether the samplers must also find hidden lamps, or must not.
+    Studies are left out. With ``and_hidden_lamps`` they are the samplers that also find hidden lamps, without it those
+    that do not.
     """
     able = {name: s for name, s in SAMPLERS.items() if s.standing != "study" and not s.refuses(facts)}
     found = [n for n, s in able.items() if light in s.finds and ("hidden lamps" in s.finds) == and_hidden_lamps]
@@ -205,7 +206,8 @@ def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
 
 
 def _how_much(scene: mi.Scene) -> str:
-    """The share of caustics of the lamps in ``behind_sharp()``, as part of a message; "" if it cannot be measured."""
+    """Part of a message: which share of the light is caustics of the lamps in ``behind_sharp()``; "" if it cannot be
+    measured."""
     from data_gen.caustics import share_of_caustics  # .1 s to import, and few scenes need it
 
     share = share_of_caustics(scene)

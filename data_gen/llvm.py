@@ -1,7 +1,8 @@
 """Finds the LLVM library that Dr.Jit's CPU backend needs, and explains what to do when there is none.
 
 Dr.Jit loads libLLVM at run time. Versions below 16 abort the whole process inside the first kernel ("Cannot select
-fminimum"), and Dr.Jit takes whichever library the linker offers first, so the choice is made here, before that.
+fminimum"). Dr.Jit takes whichever library the linker offers first. So this module chooses a library before Dr.Jit loads
+one.
 """
 
 import ctypes
@@ -35,7 +36,8 @@ def find_llvm() -> dict[Path, int]:
 
 
 def llvm_version(path: Path) -> int | None:
-    """The major version a library's name gives ("libLLVM.so.19.1", "libLLVM-14.0.6.so.1"), None if it gives none."""
+    """The major version in the name of a library ("libLLVM.so.19.1", "libLLVM-14.0.6.so.1") or of its folder, or
+    None."""
     match = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path.name) or re.search(r"llvm[-@]?(\d+)", str(path.parent))
     return int(match.group(1)) if match else None
 
@@ -44,7 +46,7 @@ def use_llvm() -> Path:
     """Points Dr.Jit to the newest usable LLVM library and returns its path.
 
     A library the user has named in DRJIT_LIBLLVM_PATH is used as it is, after a check of its version. Raises NgptError
-    when nothing usable is there.
+    if there is no usable library.
     """
     chosen = os.environ.get(ENVIRONMENT)
     if chosen:
@@ -84,7 +86,8 @@ def _remedy() -> str:
 
 
 if __name__ == "__main__":
-    # For scripts that prepare a machine: the library on success, one line of advice and status 1 otherwise.
+    # For scripts that prepare a machine: prints the library on success. On failure prints one line of advice, with
+    # status 1.
     try:
         print(use_llvm())
     except NgptError as error:

@@ -39,7 +39,8 @@ class Denoising:
     def check(self, sampler: str, spp: int | None, begun: str = "") -> None:
         """Raises an error for a method that does not run here, or that needs layers which the render does not have.
 
-        ``begun`` is the file of a render that is continued with its sampler.
+        If the render continues an earlier one, ``begun`` is the file of the earlier render, and ``sampler`` its
+        sampler.
         """
         if self.method == "auto":
             return
@@ -80,7 +81,8 @@ class Output:
         return self.kept or self.file
 
     def check(self, skip_existing: bool) -> None:
-        """Raises WrongUse for files that cannot be written, and with ``skip_existing`` for files without progress."""
+        """Raises WrongUse for files that cannot be written, and, with ``skip_existing``, for files that do not say how
+        much of the render they hold."""
         if self.denoising is not None:
             check_image(self.file, self.denoising.look.transform)
         for path in (self.kept, None if self.denoising else self.file):
@@ -98,7 +100,8 @@ class Output:
             )
 
     def left(self) -> RenderRequest | None:
-        """The request for what is left: all of it if there is no complete file, the rest of it, or None for nothing.
+        """The request for what is left to render: the whole request if there is no complete file, else the rest; None
+        if nothing is left.
 
         Raises NgptError if the stack in the file belongs to another request, or cannot be denoised as requested.
         """
@@ -142,8 +145,9 @@ class Output:
     ) -> tuple[GradientStack, dict[str, Any]]:
         """Writes a stack, or its image, or both. The header contains the request.
 
-        A stack that was ``begun`` is merged with it first, and the file with that stack is replaced. Returns the whole
-        stack, and the attributes that describe the image. If writing fails, the samples are kept in another file.
+        If there is a ``begun`` stack of an earlier render, both are merged first, and the file of the begun stack is
+        replaced. Returns the whole stack, and the attributes that describe the image. If writing fails, the samples are
+        kept in another file.
         """
         stack.attributes |= self.header
         if begun is not None:
@@ -155,10 +159,11 @@ class Output:
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
         """Makes and writes the image, and returns the attributes that describe it.
 
-        If the method fails and the stack is not kept anyway, the stack is written beside the image.
+        If the method fails and the stack was not written to ``kept``, the stack is written to a file beside the image.
         """
         assert self.denoising is not None
-        # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
+        # Dr.Jit keeps the memory of a render for the next render. At 1920x1080 this is more than a method takes, so it
+        # is freed.
         import drjit as dr
 
         dr.flush_malloc_cache()

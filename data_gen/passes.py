@@ -26,7 +26,8 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 # A function that takes the samples of one pass: it puts, or splats, one value for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
-# The rays of this number of neighbouring lanes are traced together. This is quickest if they start from one pixel.
+# A lane is one camera sample of a pass. The rays of PACKET neighbouring lanes are traced together. This is quickest if
+# these rays start from one pixel.
 PACKET = 16
 _BLOCK_LANES = 1 << 21
 # Lanes are numbered with 32 bits.
@@ -59,7 +60,7 @@ class Rounds:
 
     @property
     def said(self) -> dict[str, Any]:
-        """Header attributes that say so."""
+        """Header attributes that describe how samples depend on earlier rounds."""
         return {}
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, film: GradientFilm) -> None:
@@ -102,16 +103,16 @@ def render_passes(
     means that the number of samples is not known beforehand.
 
     The number of blocks of samples in a pass adapts to the speed of the scene and to the memory. A lane takes
-    ``lane_bytes``, or what an attribute of this name of ``sample`` says. This changes no bit of the result, which
-    depends only on the seed, the size, the number of samples and ``spp``: ``spp`` determines the first round of the
-    ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend on each
-    other: each pass is one block of ``batch`` samples per pixel, and the film's variances are computed over passes.
-    Such a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
+    ``lane_bytes``, or the attribute ``lane_bytes`` of ``sample`` if it exists. The division into passes changes no bit
+    of the result, which depends only on the seed, the size, the number of samples and ``spp``: ``spp`` determines the
+    first round of the ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass
+    depend on each other: each pass is one block of ``batch`` samples per pixel, and the film's variances are computed
+    over passes. Such a ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` gives its position.
 
     If ``sample`` has ``Rounds``, no pass crosses the end of a round. ``kind`` holds ``subpixels`` and ``gradients`` of
     the film, as in ``film_within``.
 
-    Raises NgptError where one block of samples does not fit into the memory.
+    Raises NgptError if one block of samples does not fit into the memory.
     """
     spp, seconds = budget.spp, budget.seconds
     total = spp if spp is not None else 1 << 31
@@ -174,7 +175,8 @@ def render_passes(
         now, wall = budget.clock(), time.perf_counter() - wall
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
-        # Kernels report wall seconds, and the budget may use another clock. So the share of compilation is subtracted.
+        # Kernels report their compilation in wall-clock seconds, but the budget may use another clock. So not the
+        # seconds but their share of the pass is subtracted.
         done.append((n, max((now - begin) * (1 - sum(compiled) / max(wall, 1e-9)), 1e-6)))
         watch.look(film)
         now = budget.clock()
@@ -192,7 +194,8 @@ def progress_of_time(gone: float, seconds: float) -> tuple[int, int]:
 
 
 def end_of_time(gone: float, seconds: float, early: bool) -> tuple[int, int]:
-    """The progress to report when such a render ends: all of its time or, if it ended ``early``, the elapsed time."""
+    """The progress to report when a render with a time limit ends: all of its time or, if it ended ``early``, the
+    elapsed time."""
     limit = math.ceil(seconds)
     if early:
         limit = max(1, min(limit, math.ceil(gone)))
@@ -211,7 +214,8 @@ def growing_block(pixels: int, done: int, block: int) -> int:
 
 
 def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
-    """Seconds to begin a pass, and seconds for each of its samples or blocks: a line fitted by least squares.
+    """Returns the seconds to begin a pass, and the seconds for each of its samples or blocks, from a line fitted by
+    least squares.
 
     ``done`` holds the number of samples or blocks of each pass, and its seconds. The last eight passes are used,
     without the very first one, which compiles kernels.
@@ -228,7 +232,7 @@ def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
 def compilation() -> Iterator[list[float]]:
     """Yields a list that receives the seconds in which each kernel was compiled, when the ``with`` block ends."""
     compiled: list[float] = []
-    if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads it, which empties it.
+    if dr.flag(dr.JitFlag.KernelHistory):  # The caller reads the history, which empties it.
         yield compiled
         return
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -248,7 +252,8 @@ def film_within(
     net: int = ROUND,
     **kind: Any,
 ) -> tuple[GradientFilm, int, int]:
-    """An empty film for ``spp`` samples per pixel, the samples of a pixel in a block, and the most blocks of a pass.
+    """Returns an empty film for ``spp`` samples per pixel, the number of samples per pixel in a block, and the largest
+    number of blocks in a pass.
 
     ``memory`` is in MiB. ``net`` is as in ``CameraSamples``. ``kind`` holds further parameters of the film. If memory
     is short, the film has fewer ``subpixels``, and a warning says so. Raises NgptError if one block of samples does not
@@ -260,7 +265,7 @@ def film_within(
     film = film_of(width, height, memory, lane_bytes * min(block, spp), batches=bool(batch), net=net, **kind)
     lanes = film.pixels * min(block, spp)
     most = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
-    # A block that ends within a packet would shift the next block within its packet.
+    # If blocks are not whole packets, each pass has one block. A second block would begin in the middle of a packet.
     return film, block, most if lanes % PACKET == 0 and not batch else 1
 
 
@@ -284,12 +289,13 @@ def film_of(width: int, height: int, memory: int, pixel_bytes: int, *, subpixels
 
 @contextmanager
 def recording() -> Iterator[None]:
-    """A context in which kernels can be recorded, because Python does not free scenes of earlier renders in it.
+    """A context for recording kernels. Python's garbage collector is off in it, so no scene of an earlier render is
+    freed.
 
-    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. If a second
-    scene were freed while a kernel is recorded, a lamp could be one of two in one call and the only one in the next.
-    Dr.Jit 1.5 takes the two calls for two functions, gives both the same name ("invalid redefinition of function"), and
-    ends the process.
+    A virtual function call of Dr.Jit holds one function for each object (material, lamp ...) that exists at that
+    moment. If an earlier scene were freed while a kernel is recorded, one call could hold functions of two lamps, and
+    the next call only one. Dr.Jit 1.5 takes the two calls for two functions, gives both the same name ("invalid
+    redefinition of function"), and ends the process.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -315,9 +321,9 @@ def block_of_samples(pixels: int) -> int:
 def lanes_within(
     memory: int, film: GradientFilm, lanes: int, lane_bytes: int = LANE_BYTES, instead: Advice = _no_advice
 ) -> int:
-    """The most lanes of a pass with which it and the film fit into ``memory`` MiB.
+    """The largest number of lanes with which a pass and the film together fit into ``memory`` MiB.
 
-    Raises NgptError if they are fewer than ``lanes``. Its message contains the advice of ``instead``.
+    Raises NgptError if this number is below ``lanes``. The error's message contains the advice of ``instead``.
     """
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
     most = 1 << (available.bit_length() - 1) if available > 0 else 0

@@ -3,7 +3,8 @@
 Samplers of other packages are registered too, by their entry points.
 
 Plugins belong to a variant of Mitsuba and can be registered only after it is set. So each time a variant is set,
-constructors are registered that need only a name. The classes are made on first use, since this takes half a second.
+constructors are registered that need only the name of a sampler. The classes themselves are made on first use, since
+making them takes half a second.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _made_for = ""
 def register_when_ready() -> None:
     """Registers our integrators with each variant of Mitsuba that is set, in the past or future, once it is imported.
 
-    Nothing is imported for it.
+    This function does not import Mitsuba.
     """
     if sys.modules.get("mitsuba"):
         _follow_variants()

@@ -84,20 +84,20 @@ def render(
     tails_seed: int | None = None,
     more: Mapping[str, Any] = MappingProxyType({}),
 ) -> GradientStack:
-    """The stack of a request by its sampler, from the first sensor of its loaded ``scene``; ``more`` goes into the
-    header. For ``made`` and ``tails_seed`` see ``render_stack``.
+    """Renders the stack of a request from the first sensor of its loaded ``scene``. ``more`` are further attributes of
+    the header. For ``made`` and ``tails_seed`` see ``render_stack``.
 
     The scene's reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
-    With ``diagnostics`` the images of ``data_gen.film.GradientFilm.diagnose()`` are further channels. Samplers with the
-    option ``tails`` let paths share what they find, where that works and pays (``data_gen.tails``), unless the request
-    is ``unbiased``; ``ngpt:samplerOptions`` then contains ``tails=shared``.
+    With ``diagnostics`` the images of ``data_gen.film.GradientFilm.diagnose()`` are further channels. If the sampler
+    has the option ``tails``, paths share the light that they find where this is possible and worthwhile
+    (``data_gen.tails``), unless the request is ``unbiased``; ``ngpt:samplerOptions`` then contains ``tails=shared``.
 
     The same seed, options and number of samples give the same bits, however the render was ended. If the number of
     samples is not known beforehand, the option points=rounds is used and recorded in ``ngpt:samplerOptions``. A render
     that ``stop`` ended before it had all samples is marked by ``ngpt:unfinished``.
 
-    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for a
-    scene that the sampler cannot render.
+    Raises Unfinished, with the stack of the samples rendered before, if a pass after the first fails; and NgptError for
+    a scene that the sampler cannot render.
     """
     spp, seed, budget = request.spp, request.seed, request.budget
     seconds, clock = budget.seconds, budget.clock
@@ -196,7 +196,7 @@ def stack_of(
 ) -> GradientStack:
     """The stack of a sensor's film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes.
 
-    It is the crop window of the sensor, within a picture of the whole size.
+    The stack covers the sensor's crop window, and records where this window lies in the whole picture.
     """
     attributes = {
         "ngpt:seed": str(seed),

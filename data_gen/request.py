@@ -1,7 +1,7 @@
 """The request for a render: one frozen record, made once by the command line or by Python, and passed down whole.
 
-Each stack's header has it in canonical form. A render continues a file if the two requests differ at most in their
-budgets, and the file has fewer samples (``data_gen.begun``).
+The header of each stack contains its request in canonical form. A render can continue a file if its request and the
+file's differ at most in their budgets, and the file has fewer samples (``data_gen.begun``).
 """
 
 from __future__ import annotations
@@ -188,7 +188,8 @@ class RenderRequest:
         }
 
     def _scene(self, frame: int | None) -> str:
-        """The scene's name, and a checksum of its file and of all that changes it; meshes and textures do not count."""
+        """The scene's name, and a checksum of its file and of all arguments that change it. Meshes and textures are
+        left out."""
         given = dict(self.parameters) | ({} if self.sensor is None else {"--sensor": str(self.sensor)})
         scene = self.scene
         if frame is not None:
@@ -206,7 +207,7 @@ class RenderRequest:
 
 
 def said_by(attributes: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The canonical request in the header of a file, with its budget; None if it has none."""
+    """The canonical request in the header of a file, with its budget; None if the header has no request."""
     try:
         said = json.loads(str(attributes.get(REQUEST, "")))
     except (ValueError, RecursionError):  # the file may come from another program
@@ -225,9 +226,9 @@ _WATCHED = {each.name for each in fields(Watch)}
 
 
 def asked(scene: Any, given: Mapping[str, Any], frames: Iterable[int] = ()) -> tuple[RenderRequest, Watch]:
-    """The request and the watch of a call by keywords. Keywords that neither of them has are options of the sampler.
+    """The request and the watch of a call by keywords. Keywords that are fields of neither are options of the sampler.
 
-    A ``scene`` that is a request already is returned as it is; raises WrongUse if anything else is ``given``.
+    If ``scene`` is a request already, it is returned as it is; raises WrongUse if ``given`` would change it.
     """
     watch = Watch(**{name: value for name, value in given.items() if name in _WATCHED})
     known = {name: value for name, value in given.items() if name in FIELDS}

@@ -37,7 +37,7 @@ def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, sec
 
 def warm_up(scene: mi.Scene, options: Options) -> GradientStack:
     stack = render(scene, options, 1, 0, seconds=None)
-    # Kernels depend on the number of samples only where this decides whether there are subpixels.
+    # Kernels do not depend on the number of samples, except that with "auto" this number decides about subpixels.
     if options.get("subpixels") == "auto" and (k := find(options["sampler"]).subpixels("auto", None)) > 1:
         render(scene, {**options, "subpixels": k}, 1, 0, seconds=None)
     return stack

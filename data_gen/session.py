@@ -1,4 +1,4 @@
-"""The functions of Python that do what ``ngpt render`` does: a scene's stack, and the stacks of a shot's frames.
+"""Python functions that do what ``ngpt render`` does: they render a scene's stack, or the stacks of a shot's frames.
 
 stack, plan = data_gen.render_scene("scene.xml", spp=64)
 stack, plan = data_gen.render_scene(scene, seconds=60, method="auto")  # the method to denoise with: plan.method
@@ -93,10 +93,10 @@ def render_frames(
     ``skip``     called when a frame's turn has come; returns whether to leave the frame out
     ``progress`` frame -> a function that is called as the ``progress`` of ``render_scene``
 
-    All else is as in ``render_scene``; ``data_gen.frames.shot`` describes seeds and motion. A frame that ``stop`` ended
-    early is the last one, with ``ngpt:unfinished``; with ``dt`` it is not yielded. A shot that changes by other means
-    than a file's parameters is a ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene`` does, and for
-    cameras without a projection.
+    All else is as in ``render_scene``; ``data_gen.frames.shot`` describes seeds and motion. If ``stop`` ends a frame
+    early, this frame is the last one and has the attribute ``ngpt:unfinished``; with ``dt`` it is not yielded. A shot
+    whose frames differ in more than a scene file's parameters is given as a ``data_gen.frames.shot.Shot``. Raises
+    NgptError as ``render_scene`` does, and for cameras without a projection.
     """
     request, watch = asked(scene, {"spp": spp, "seed": seed, "sampler": sampler, **given}, frames)
     if not request.frames:

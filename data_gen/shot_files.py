@@ -1,4 +1,4 @@
-"""The frames of a shot as files: all frames, missing frames, the part of one machine, or all on a Dask cluster."""
+"""Writes the frames of a shot to files: all frames, missing frames, one machine's part, or all on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def write_frames(
         made(written, len(ours))
 
     def skip(frame: int) -> bool:
-        # Not checked before the frame's turn, since several machines may work on one shot.
+        # The file is checked only when the frame's turn has come, since another machine may have written it by then.
         if part_of[frame] != number or frame in gone_on:
             return True
         there = skip_existing and outputs[frame].left() is None and outputs[frame].done()
