@@ -1,19 +1,19 @@
 """The variance of pixels whose samples are points of nets, and so not independent.
 
-Samples of a pixel that are points of one net (``data_gen.paths.streams``) keep apart from each other. The sample
-variance assumes that they are independent, so it overstates the noise of their mean. The render itself shows by how
-much. The n samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``): n1 samples with
-mean a and n2 samples with mean b. The parts are compared by their *contrast*
+Samples of a pixel that are points of one net (``data_gen.paths.streams``) are spread more evenly than independent
+samples. The sample variance assumes independent samples, so it overstates the noise of the mean. The render itself
+shows by how much. The n samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``): n1
+samples with mean a and n2 samples with mean b. The parts are compared by their *contrast*
 
     (b - a) sqrt(n1 n2) / n,
 
 whose expected square is the variance of the pixel's mean if samples are independent. Points of nets help much where
 little light is found by chance, and not at all where all of it is found by chance. So there is a family of laws by
 which the noise may fall, and ``data_gen.film.nets.law`` gives the expected square and the variance of the mean for each
-law. One square says little about a pixel, but pixels of about the same noise together show which law holds. They show
-less if most of the noise is in few pixels. So the factor is a mean over all laws, weighted by their probabilities. It
-is a geometric mean, since errors of factors are ratios. All laws expect the same contrast of two samples; there, only
-the prior of each law counts.
+law. One square says little about a pixel, but pixels of about the same noise together show which law holds. A group in
+which few pixels have most of the noise shows this less clearly. So the factor for the variance is a mean over all laws,
+weighted by their probabilities. It is a geometric mean, since errors of factors are ratios. For pixels with two
+samples, all laws expect the same contrast, so only the prior of each law counts.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)
     # The pixel itself is left out: its own variance is large where it has a rare sample, and rare samples are the
-    # independent ones. Groups by a pixel's own variance would put all of these into one group.
+    # independent ones. Groups by a pixel's own variance would put all pixels with rare samples into one group.
     filled = np.where(good, variances, 0)
     sums = _AROUND**2 * box_means(filled, _AROUND)
     around = np.where(good, np.maximum(sums - filled, 0), np.inf).ravel()
@@ -80,9 +80,10 @@ def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float)
     """The probability of each law, (laws), given the observed ``ratio`` of squared contrasts to variances; ``expected``
     are the ratios that the laws predict.
 
-    A sample variance is a mean over ``contrasts`` orthogonal contrasts, and the observed contrast is one of them. The
-    ratio of its square to the mean square of the others, divided by what a law expects, has an F distribution. Its
-    degrees of freedom are one and the number of the others, for each of the ``pixels`` of equal noise.
+    A sample variance is a mean over ``contrasts`` orthogonal contrasts, and the observed contrast is one of them.
+    Divide the square of the observed contrast by the mean square of the other contrasts, and by the value that a law
+    expects for this ratio. The result has an F distribution. Its degrees of freedom are 1 and the number of other
+    contrasts, for each of the ``pixels`` of equal noise.
     """
     others = contrasts - 1
     if others < 1e-6:

@@ -20,9 +20,8 @@ from ngpt.stack import GradientStack
 from ngpt.subpixels import SUBPIXELS, means
 from ngpt.windows import Place
 
-# The shifts of samplers, (x, y) in pixels, y down: forward ("+") and backward ("-") for each difference of the
-# contract. The film keeps the differences "neighbour - base" at the base pixel and combines both directions when it
-# develops.
+# The shifts of samplers, (x, y) in pixels, y down: forward ("+") and backward ("-") for each layer of differences. The
+# film keeps the differences "neighbour - base" at the base pixel and combines both directions when it develops.
 SHIFTS = {
     f"{layer}{sign}": (factor * x, factor * y)
     for layer, (x, y, _) in DIFFERENCES.items()
@@ -38,8 +37,8 @@ _SPLIT = ("diffuse", "specular")
 # Features whose noise is summarised by one number, see ``GradientFilm.feature_noise``
 _FEATURES = ("albedo", "normal")
 _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
-# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and a second copy
-# of the moments of one name, while they are updated.
+# Bytes per strand (a pixel's samples are summed in one or more strands): two counts for each of 10 names, double means
+# of 26 channels and sums of squares of 21; and a second copy of the moments of one name, while they are updated.
 _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
 # Without gradients: 5 names, 13 channels, 9 sums of squares. This leaves memory for more subpixels.
 _STRAND_BYTES_WITHOUT = 5 * 8 + (13 + 9) * 8 + (8 + 6 * 8)
@@ -233,7 +232,7 @@ class GradientFilm:
         self._blocks_each[pixels] += blocks
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
-        """One more value for each pixel and name: the mean over the pass, splats included."""
+        """Adds one more value for each pixel and name: the mean over the pass, splats included."""
         self.batch = self.batch or spp
         if spp > self.batch:
             raise ValueError(f"a batch of {spp} samples after batches of {self.batch}: only the last may be smaller")
@@ -369,7 +368,7 @@ class GradientFilm:
         return statistics(self.moments[name], self.strands, self.batch)
 
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
-        """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and its variance.
+        """Returns one difference, the mean of its two directions (survey, Algorithm 1), and its variance.
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently, from
         the successor by the backward shift. Each direction estimates its own part of the difference. So if one pixel
@@ -413,7 +412,8 @@ class GradientFilm:
 
     @property
     def _net_of_numbers(self) -> int:
-        """The number of values in the first round, a power of two. A batch is a block of points."""
+        """The number of values in the first round, a power of two. With batches, a value is the mean of a block of
+        points."""
         net = self.net // self.batch if self.batches else self.net
         return 1 << max(net.bit_length() - 1, 0)
 

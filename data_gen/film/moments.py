@@ -27,8 +27,8 @@ class Moments:
 
 @dataclass
 class Earlier:
-    """Two sets of earlier samples of a strand: those before the last sample whose number is a power of two, and those
-    before half that number.
+    """Two sets of earlier samples of a strand. Let P be the largest power of two up to the number of the strand's last
+    sample. The sets are the samples with numbers below P, and those with numbers below P / 2.
 
     ``counts`` and ``means`` have one entry for each set: the number of samples, UInt32, and a list of a Float32 for
     each channel, whose rounding is far below the noise. ``bits`` is the number of bits in the number of the last
@@ -71,7 +71,8 @@ def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
     Float32 = dr.float32_array_t(mi.Float)
     bits = 32 - dr.lzcnt(number)
     begins = bits != earlier.bits
-    # If a strand has no sample between the two numbers, all its samples are before the smaller number, too.
+    # If the number of bits grows by more than one, the strand has no sample from P / 2 up to P. Then all its earlier
+    # samples are below P / 2, too.
     follows = bits == earlier.bits + 1
     last, half = earlier.counts
     counts = [dr.select(begins, old.count, last), dr.select(begins, dr.select(follows, last, old.count), half)]

@@ -47,7 +47,8 @@ class Law(NamedTuple):
 
 
 def split(n: int) -> int:
-    """The number of the first of ``n`` > 1 samples that are compared with the rest; either part has a third or more.
+    """How many of ``n`` > 1 samples form the first part, which is compared with the rest. Each part has at least a
+    third.
 
     It is the largest power of two below n, or half of it.
     """
@@ -74,7 +75,7 @@ def _covariances(begin: int, end: int, net: int) -> np.ndarray:
     total, start, size = np.zeros(len(RATES)), 0, net
     while start < end:
         total += _in_block(begin, end, start, size)
-        # A round is as large as all before it together.
+        # A round is as large as all earlier rounds together.
         start += size
         size = start
     return total
