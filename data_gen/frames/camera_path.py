@@ -32,8 +32,8 @@ class CameraPath:
     """Key frames in rising order. Before the first and after the last one the camera rests.
 
     A camera's scale, which exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a
-    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others. Its
-    message begins with the name of the ``file``, if given.
+    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others. The
+    error's message begins with the name of the ``file``, if given.
     """
 
     def __init__(self, keys: list[Key], file: str | Path = ""):
@@ -50,8 +50,8 @@ class CameraPath:
     def at(self, frame: float) -> Key:
         """The camera at a frame.
 
-        Between two keys with a target, origin, target, up and fov are interpolated linearly. Otherwise the position is
-        interpolated linearly, and the orientation turns evenly about one axis.
+        If both neighbouring keys have a target, then origin, target, up and fov are interpolated linearly. Otherwise
+        position and fov are interpolated linearly, and the orientation turns evenly about one axis.
         """
         after = bisect_right([key.frame for key in self.keys], frame)
         if after == 0 or after == len(self.keys):
@@ -83,7 +83,8 @@ def look_at(origin, target, up) -> np.ndarray:
 
 
 def _rigid(key: Key, where: str) -> np.ndarray:
-    """The matrix of a key without its scale. Direction of view, side that is up, and reflection stay the same."""
+    """The matrix of a key without its scale. The direction of view, the side that is up and the reflection stay the
+    same."""
     matrix = np.asarray(key.to_world, np.float64)
     # Numbers of the renderer are single precision.
     with np.errstate(over="ignore"):

@@ -18,10 +18,10 @@ from ngpt.errors import NgptError, WrongUse
 from ngpt.system.reading import read_bytes
 from ngpt.system.records import check
 
-# A glTF camera looks along its -z with +x to the right, one of Mitsuba's along +z with +x to the left.
+# A glTF camera looks along its -z, with +x to the right. Mitsuba's cameras look along their +z, with +x to the left.
 _TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
 _DEFAULTS = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1.0, 1, 1]}
-# The most frames: more than anyone animates, so that the times in a broken file do not fill the memory
+# The largest number of frames, more than anyone animates. The limit keeps a broken file from filling the memory.
 _MOST = 1_000_000
 _MOST_BYTES = 2**30  # of a file or a buffer beside it
 
@@ -146,7 +146,7 @@ def _beside(path: Path, uri: str) -> Path:
 
 
 def _local(node: dict[str, Any], number: int, channels: dict[tuple[int, str], Channel], time: float) -> np.ndarray:
-    """The matrix (4, 4) of a node to its parent."""
+    """The matrix (4, 4) from the space of a node to that of its parent."""
     moves = [name for name in _DEFAULTS if (number, name) in channels]
     if "matrix" in node and not moves:
         return np.asarray(node["matrix"], np.float64).reshape(4, 4).T

@@ -1,12 +1,13 @@
-"""Motion vectors. They lead from each pixel to where the point that it shows was on the film one frame before.
+"""Motion vectors. A motion vector leads from a pixel to the place on the film where the point that the pixel shows was
+one frame before.
 
 A pixel shows the first smoothly scattering point on the ray through its centre. The hit is looked up in the scene of
 the frame before by shape, primitive and barycentric coordinates, which works for any deformation of a mesh. Instances,
 and shapes that are no meshes, move by their ``to_world``. A ``Snapshot`` keeps the geometry of the scene before.
 
-For a thing seen in a mirror or through glass its apparent place counts: the end of a straight ray as long as the path.
-This is exact for plane mirrors in a scene at rest. It ignores the motion of things seen in curved mirrors. Rays that
-escape show points at infinity. Surfaces count, media do not.
+The motion of a thing seen in a mirror or through glass is that of its apparent place: the end of a straight ray as long
+as the path. This is exact for plane mirrors in a scene at rest. It ignores the motion of things seen in curved mirrors.
+Rays that escape show points at infinity. Surfaces count, media do not.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ class Snapshot:
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
-    """The state of a scene; ``shapes`` of an earlier snapshot, if they are known to be the same."""
+    """The state of a scene; ``shapes`` are those of an earlier snapshot, if they are known not to have changed
+    since."""
     if shapes is None:
         shapes = tuple(geometry(shape) for shape in scene.shapes())
     sensor = scene.sensors()[0]
@@ -61,7 +63,7 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
 
 
 class _Middle:
-    """A sampler of constants: it always takes the likelier of two ways."""
+    """A sampler that always returns 0.5, so that a path always takes the likelier of two ways."""
 
     def next_1d(self, active=True) -> mi.Float:
         return mi.Float(0.5)

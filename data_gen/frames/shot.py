@@ -1,4 +1,4 @@
-"""Shots: a scene over time, and its stacks frame by frame."""
+"""Shots (frame sequences): a scene over time, and its stacks frame by frame."""
 
 from __future__ import annotations
 
@@ -61,8 +61,8 @@ class Remembering:
     ) -> GradientStack:
         """The stack of frame number ``index`` of the shot, after ``begin``. ``shapes`` are those of the ``scene``.
 
-        If the shot ``changes``, it must not be the same object as the scene of the frame before, which must stay as it
-        was in that frame.
+        If the shot ``changes``, ``scene`` must not be the same object as the scene of the frame before. That scene must
+        stay as it was in its frame.
         """
         start, self._making = time.perf_counter() - self._making, 0.0
         spp = int(self.request.spp or 0)
@@ -153,18 +153,18 @@ def render_shot(
     """Yields (frame, stack) for each frame of a request. A frame is left out if ``skip`` returns True at its turn.
 
     Stacks have the layer ``motion`` to the previous frame of the request. For the first frame, it is the motion to the
-    frame that a shot of the same step would have before it, or all NaN if there is none. Motion refers to the whole
+    frame one step earlier, which is not rendered; all NaN if there is no such frame. Motion refers to the whole
     picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
     depend on which other frames are rendered. Only the cache of tails has the same ``seed`` in all frames, because its
     smooth noise would flicker. Errors are as in ``render_stack``; cameras without a projection raise NgptError.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
-    frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, it needs the scene of the
-    previous frame, so two scenes are in memory and take turns.
+    frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, such a sampler also needs the
+    scene of the previous frame. Then two scenes are in memory and take turns.
 
     With ``dt`` pairs of samples per pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of separate samples
-    (``data_gen.frames.time_differences``) by Mitsuba's integrator. If parameters change, scenes are loaded twice per
-    frame then. The time for this is included in ``ngpt:seconds``.
+    (``data_gen.frames.time_differences``) by Mitsuba's integrator. If parameters change, scenes are then loaded twice
+    per frame. The time to render ``dt`` is included in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
     last = None

@@ -51,7 +51,8 @@ def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None
 
 
 def _partners(camera: CameraSamples, motion: np.ndarray) -> mi.Vector2f:
-    """The motion of each sample's pixel. Where it is not known, it leads off the film."""
+    """The motion of each sample's pixel. Where the motion is not known, a motion that leads off the film is
+    returned."""
     pixels = np.where(np.isfinite(motion).all(axis=-1, keepdims=True), motion, -1e6).reshape(-1, 2)
     return mi.Vector2f(*(dr.gather(mi.Float, mi.Float(pixels[:, axis]), camera.pixel) for axis in (0, 1)))
 
@@ -64,7 +65,7 @@ def difference(
     total = sum(weights)
     batches = [(here - there).astype(np.float64) for (_, here), (_, there) in zip(now, before, strict=True)]
     mean = sum(n * batch for n, batch in zip(weights, batches, strict=True)) / total
-    # A batch of n samples has a variance of 1/n of theirs.
+    # The mean of a batch of n samples has 1/n of the variance of a sample.
     squares = sum(n * np.square(batch - mean) for n, batch in zip(weights, batches, strict=True))
     variance = squares / (total * (len(batches) - 1)) if len(batches) > 1 else np.full_like(mean, np.nan)
     return mean.astype(np.float32), variance.astype(np.float32)

@@ -34,7 +34,7 @@ class BentLamps:
 
     @staticmethod
     def of(scene: mi.Scene) -> BentLamps | None:
-        """None where no lamp is bent."""
+        """The bent lamps of ``scene``, or None if it has none."""
         # Shapes that are found by their emitters are not always known to be meshes.
         found = [shape for shape in scene.shapes() if shape.is_emitter() and is_bent(shape)]
         numbers = {emitter.ptr: number for number, emitter in enumerate(scene.emitters())} if found else {}

@@ -21,10 +21,10 @@ class CameraSamples:
     """``spp`` camera samples for each pixel of a sensor, or for some pixels, from sample number ``first`` on.
 
     Lanes are ordered by blocks of ``block`` samples (default: all samples are one block), within a block by pixel, and
-    within a pixel by sample. ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
-    whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and ``sample`` the
-    number of its sample. ``random`` holds the random numbers for the paths. A clone of it gives the same numbers, which
-    correlates a path with its shifted copies.
+    within a pixel by sample. ``spp`` is a multiple of ``block``. For a given seed, sample i of a pixel is always the
+    same, whatever other samples are rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and
+    ``sample`` the number of its sample. ``random`` holds the random numbers for the paths. A clone of it gives the same
+    numbers, which correlates a path with its shifted copies.
 
     ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0 for independent samples.
     ``some``, UInt32, lists the pixels to sample, which may repeat; then ``first`` is a UInt32 with a number for each.
@@ -53,7 +53,8 @@ class CameraSamples:
         self._see(sensor)
         self.pixels = int(dr.prod(self.size)) if some is None else dr.width(some)
         lane = dr.arange(mi.UInt32, self.pixels * spp)
-        # Opaque, here and below: a literal would be compiled into the kernel, so each value would need a new kernel.
+        # Numbers are opaque here and below. A literal would be compiled into the kernel, so each value would need a new
+        # kernel.
         self.block = block or spp
         in_pixel, in_block = (dr.opaque(mi.UInt32, n * self.block) for n in (1, self.pixels))
         pixel = lane % in_block // in_pixel

@@ -6,9 +6,9 @@ there it misses the lamp. So their light goes into a separate layer, for methods
     rough   the path has scattered smoothly at a connectable vertex
     late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
 
-Both are properties of a path, not of its shift. So primal - caustic is the image of a subset of the paths, and dx and
-dy are the differences of this image. A path of the layer counts 0 in them, whether it is a base path or a shifted copy.
-This is exact, because the shift is rejected from both sides if either path of a pair is late.
+``rough`` and ``late`` are properties of a path, not of its shift. So primal - caustic is the image of a subset of the
+paths, and dx and dy are the differences of this image. A path of the layer counts 0 in dx and dy, whether it is a base
+path or a shifted copy. This is exact, because the shift is rejected from both sides if either path of a pair is late.
 """
 
 from __future__ import annotations
@@ -31,15 +31,17 @@ def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, conn
 
 def lit_late(rough: mi.Bool, late: mi.Bool, connectable: mi.Bool) -> mi.Bool:
     """Whether light from a sampled emitter, scattered at this vertex, belongs to the layer."""
-    # The same as if a smooth event had sampled the direction: both techniques must split the light alike.
+    # This is the rule for a direction that a smooth event has sampled, because both techniques must split the light
+    # alike.
     return late | (rough & ~connectable)
 
 
 def ends_late(smooth: mi.Bool, connectable: mi.Bool, sharp_next: mi.Bool) -> mi.Bool:
     """Whether all light from behind the next vertex belongs to the layer.
 
-    It does if that vertex has no hole and does not scatter widely: then the path is late after any event there. A
-    shifted copy would be of no use, so it is rejected one step before a path is late, again from both sides.
+    It does if the next vertex has no hole and does not scatter widely, because then the path is late after any event
+    there. A shifted copy of such a path would be of no use. So the shift is rejected one step before the path is late,
+    again from both sides.
     """
     return smooth & connectable & sharp_next
 

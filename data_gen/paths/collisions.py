@@ -1,10 +1,11 @@
 """Segments through media whose density varies (grids): null collisions, and how a shift maps them.
 
-In a grid the transmittance can only be estimated. So a path consists not only of its vertices, but also of the null
-collisions on its way. They occur at the rate of the majorant μ and change nothing. In this larger path space all
-densities are known. Let M be the majorant's optical depth of the segment, in its grids only. Then n null collisions
-with a vertex at the end have the density exp(-M) ∏ σn(x_i) / μ · σ. The integrand has σs in place of σ, and one value
-for each colour. The distances between collisions, in optical depths m of the majorant, are exponentially distributed; m
+In a grid the transmittance can only be estimated. So a path consists not only of its vertices, but also of null
+collisions on its way, which change nothing. All collisions together, null and real, occur at the rate of the majorant
+μ, an upper bound of the extinction σ = μ - σn. In this larger path space all densities are known. Let M be the
+majorant's optical depth of the segment, in its grids only. Then n null collisions with a vertex at the end have the
+density exp(-M) ∏ σn(x_i) / μ · σ. The integrand has the scattering coefficient σs in place of σ, and one value for each
+colour. The distances between collisions, in optical depths m of the majorant, are exponentially distributed; m
 continues through all grids and gaps that the segment crosses. A replay takes the same steps and random numbers: r = 1.
 A reconnection moves the collisions of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n. The steps are
 generated again from the base path's key, so only n has to be kept. Homogeneous media use one exponential number for
@@ -167,7 +168,7 @@ def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, targe
         ahead = dr.select(collides, scale * step(key, n), ahead)
         fresh = ~collides & hit.is_valid() & passes(hit.shape)
         crossing &= collides | fresh
-        # Where N is 0 the transmittance is 0.
+        # Where the product N is 0, the transmittance is 0, and the rest of the segment does not matter.
         crossing &= dr.max(N) > 0
         if crossing & fresh:
             ray, medium, reach = onward(ray, hit, medium, reach, target)
@@ -185,7 +186,7 @@ def rescale(
     which is the ratio of the densities.
     """
     way = {"channel": channel, "key": base.key, "target": target}
-    # First without collisions, for M'
+    # The first crossing has no collisions; it only measures M'.
     none, one = mi.UInt32(0), mi.Float(1)
     τ, hit, last, end, M, N = cross(passes, trace, ray, medium, reach, **way, scale=one, most=none, active=active)
     scale = M / base.M

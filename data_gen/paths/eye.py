@@ -80,7 +80,7 @@ class Eye:
         sensor = camera.sensor
         numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
         planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
-        # In spectral variants nothing is recorded once, and rays have wavelengths.
+        # Spectral variants do not need the copy: they record no function once. Its rays would also lack wavelengths.
         thin = ThinLens.of(sensor) if camera_name(sensor) == "thinlens" and not mi.is_spectral else None
         return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area, thin)
 

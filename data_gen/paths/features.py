@@ -8,7 +8,7 @@ import mitsuba as mi
 from data_gen.paths.spectrum import reflectance_to_rgb
 from data_gen.scenes.facts import media_of, shapes_of
 
-# The longest chain of mirrors. The features behind a longer one are zero, as for a path that escapes.
+# The longest chain of mirrors. Behind a longer chain the features are zero, as for a path that escapes.
 MAX_SPECULAR_VERTICES = 32
 
 # Steps of a ray through a medium whose density varies

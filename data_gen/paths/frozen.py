@@ -1,8 +1,9 @@
 """Functions whose kernels are recorded once in a render, and only launched in later calls.
 
 Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are. A pass of photons has few
-camera samples and many kernels. A function is recorded again if its arrays have other types, if the widths of two
-arrays become equal or a width becomes 1, or if a scene is loaded or freed in the process.
+camera samples and many kernels, so most of its time could go into recording. A function is recorded again if its arrays
+have other types, if the widths of two arrays become equal or a width becomes 1, or if a scene is loaded or freed in the
+process.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Frozen:
     def __call__(self, f: Callable, *args: Any, sums: Callable | None = None) -> Any:
         """``sums``, if given, makes the last argument of f, to which f adds.
 
-        A call that fails may have added already, so each try gets new sums.
+        A call that fails may already have added to the sums, so each try gets new sums.
         """
 
         def tried(f: Callable) -> Any:
@@ -51,8 +52,8 @@ class Frozen:
             if f not in self.functions:
                 self.functions[f] = _Recorded(as_wide_as_arguments(f), self.state)
                 # Dr.Jit turns each number that it finds into an array. A number that belongs to several objects becomes
-                # several arrays in the first call and a single one in the next, which would have f recorded again. So a
-                # function that does nothing is called first.
+                # several arrays in the first call and a single array in the next call, so f would be recorded again. To
+                # prevent this, a function that does nothing is called first.
                 tried(self.settle)
             return tried(self.functions[f])
         except RuntimeError as error:
@@ -73,9 +74,9 @@ class Frozen:
 class _Recorded:
     """A function that ``dr.freeze`` records. ``state`` holds the arrays that it uses besides its arguments.
 
-    ``dr.freeze`` makes a class, which only Python's collector of reference cycles frees. It would keep alive everything
-    it refers to until then, so it has only a weak reference to this object. Scenes of earlier renders make kernels
-    larger, and freeing them has functions recorded again.
+    ``dr.freeze`` makes a class, which only Python's collector of reference cycles frees. Until then, this class would
+    keep everything alive that it refers to, so it has only a weak reference to this object. Otherwise scenes of earlier
+    renders would stay in memory. They make kernels larger, and when they are freed, functions are recorded again.
     """
 
     def __init__(self, f: Callable, state: list):
@@ -94,9 +95,9 @@ def _nothing(*args: Any) -> None:
 
 
 def _of_each_kind() -> list:
-    """A pointer of each type. A virtual call goes through all objects of its type in the process, but Dr.Jit finds them
-    only if the function has such a pointer. Otherwise a material that no shape uses would keep the function from being
-    recorded.
+    """A pointer of each type. A virtual call uses all objects of its type in the process, but Dr.Jit finds these
+    objects only if the function has a pointer of that type. Without it, a material that no shape uses would keep the
+    function from being recorded.
     """
     return [dr.zeros(getattr(mi, name)) for name in dir(mi) if name.endswith("Ptr")]
 
@@ -122,7 +123,8 @@ def _wake_lamps(scene: mi.Scene) -> None:
 
 
 def as_wide_as_arguments(f: Callable) -> Callable:
-    """f with constant results made to depend on an argument. Dr.Jit 1.5 would keep their width from the first call."""
+    """f, but with constant results made to depend on an argument. Dr.Jit 1.5 would keep the width of a constant from
+    the first call."""
 
     def widened(*args: Any) -> Any:
         by_width = {dr.width(leaf): leaf for leaf in leaves(args)}
@@ -205,7 +207,8 @@ def evaluated(f: Callable) -> Callable:
 
 
 def arrays(owner: Any) -> list:
-    """Replaces the arrays in the attributes of an object, and of objects there, by copies, and returns the copies.
+    """Replaces the arrays in the attributes of an object, and of the objects in its attributes, by copies. Returns the
+    copies.
 
     Kernels depend on the alignment of their arrays, which varies for arrays of NumPy. Without copies kernels would be
     compiled again.

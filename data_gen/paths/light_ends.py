@@ -1,4 +1,4 @@
-"""The light's end of paths: where light starts, and with which density."""
+"""The ends of paths at lights: where light starts, and with which density."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AREA, POINT, FAR = 0, 1, 2
 
 @dataclass
 class LightRay:
-    """The first edge of a light path, and the light's end of it."""
+    """The first edge of a light path, and the point on the emitter where it starts."""
 
     ray: mi.Ray3f
     β: mi.Spectrum  # Le cos / p
@@ -54,7 +54,7 @@ class LightEnds:
                 )
         box = scene.bbox()
         self.center = mi.ScalarPoint3f(box.center())
-        # A disk that only just covers the corners would lose some to rounding.
+        # The radius has a margin. Without it, rounding could leave corners of the scene outside the disk.
         self.radius = 1.001 * float(np.linalg.norm(np.array(box.extents()))) / 2
         self.kinds = set(kinds)
         self.emitters = scene.emitters_dr() if emitters else None
@@ -158,7 +158,7 @@ class LightEnds:
         return LightRay(mi.Ray3f(origin, d, time, wavelengths), β, emitter, index, end, delta, front)
 
     def _place_bent(self, place: mi.PositionSample3f, lamp: mi.UInt32, u: mi.Point2f, active) -> mi.Normal3f:
-        """Changes ``place`` to a point that ``BentLamps`` samples, on bent lamps. Returns ``front``, for all lamps."""
+        """On bent lamps, changes ``place`` to a point that ``BentLamps`` samples. Returns ``front``, for all lamps."""
         bent = active & self.bent.has(lamp, active)
         ours, front = self.bent.point(lamp, u, bent), mi.Normal3f(place.n)
         pdf = dr.gather(mi.Float, self.bent.per_area, lamp, bent)
@@ -219,7 +219,8 @@ def _kind(emitter: mi.Emitter) -> int | None:
 
 
 def _table(scene: mi.Scene, number: int, emitter: mi.Emitter, kind: int) -> list[float]:
-    """Position, axis and cosine of the cutoff of a point or spot; last, the density of starts on a sphere."""
+    """Position, axis and cosine of the cutoff of a point or spot. The last entry is the density of starts on a
+    sphere."""
     if kind == AREA:
         shape = emitter.get_shape()
         ball = shape.class_name() == "Sphere"

@@ -17,17 +17,18 @@ from data_gen.scenes.load import path_depths
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; for spheres it samples the visible part.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
-# What emission depends on. With thousands of shapes, all fields would take twice as long to record.
+# The fields of an interaction that emission depends on. With thousands of shapes, computing all fields would take twice
+# as long to record.
 _EMISSION = mi.RayFlags.UV | mi.RayFlags.ShadingFrame
 
 
 class Lights:
     """The emitters of a scene, and whether equal random numbers sample the same point or direction from everywhere.
 
-    They do for emitters that are infinitely far away, and for area lights on shapes that are sampled uniformly.
-    Replaying the sample at another vertex changes only the solid angle, so such emitters need not be sampled again.
-    ``shared`` is True if all emitters of the scene are of these kinds. ``near`` and ``far`` say whether there are
-    emitters at finite and at infinite distance. ``places`` chooses lamps by place; None means that the scene's own
+    Equal random numbers do so for emitters that are infinitely far away, and for area lights on shapes that are sampled
+    uniformly. Replaying the sample at another vertex changes only the solid angle, so such emitters need not be sampled
+    again. ``shared`` is True if all emitters of the scene are of these kinds. ``near`` and ``far`` say whether there
+    are emitters at finite and at infinite distance. ``places`` chooses lamps by place; None means that the scene's own
     probabilities hold everywhere. ``bent`` are the lamps that Mitsuba samples with a wrong density, or None. A bent
     lamp does not shine to all vertices in front of its faces, so scenes with bent lamps are not shared.
     """
@@ -46,7 +47,7 @@ class Lights:
     def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
         """A direction sample, its Le / p, and the chosen lamp, which is None if lamps are not chosen by place.
 
-        The first two are as from ``scene.sample_emitter_direction(x, u, False, active)``.
+        The sample and Le / p are as from ``scene.sample_emitter_direction(x, u, False, active)``.
         """
         if not self.places:
             return *self.anywhere(scene, x, u, active), None
@@ -58,7 +59,7 @@ class Lights:
         return sample_emitter(scene, self.bent, x, u, active)[:2]
 
     def seen(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
-        """As ``anywhere()``, with Le V / p."""
+        """As ``anywhere()``, but with Le V / p, where V is the visibility of the sampled point."""
         if not self.bent:
             return scene.sample_emitter_direction(x, u, True, active)
         light, weight = self.anywhere(scene, x, u, active)
@@ -214,8 +215,8 @@ def emission_in_pixel(
 
 
 def _sum_of(seen: list[tuple[mi.Ray3f, mi.Spectrum]], Le: mi.Spectrum, emission: Callable) -> mi.Spectrum:
-    """The sum of Le and the weighted emission that the rays in ``seen`` meet. In a loop ``emission``, a call to all
-    shapes, is recorded only once."""
+    """The sum of Le and the weighted emission that the rays in ``seen`` meet. The rays are handled in a loop, so that
+    ``emission``, a call to all shapes, is recorded only once."""
     kind = type(Le)
 
     def add(i: mi.UInt32, Le: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:

@@ -201,7 +201,8 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
 
 
 def onward(ray, hit, medium, reach: mi.Float, target: mi.Point3f | None) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Float]:
-    """``beyond()``, and what is left of ``reach``; aimed at the ``target`` anew, where there is one and it is finite.
+    """Returns what ``beyond()`` returns, and what is left of ``reach``. If there is a finite ``target``, the ray is
+    aimed at it anew.
 
     Behind a boundary a ray is displaced along the normal. A displaced ray that grazes the target's surface could meet
     this surface before the target and seem to be blocked.

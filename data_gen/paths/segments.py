@@ -4,7 +4,7 @@ A *segment* leads from vertex to vertex. It goes straight through index-matched 
 do not count in the length of a path, and emitters are sampled and found through them.
 
     σ, σs       extinction and scattering coefficients, one for each colour
-    c           the colour by which the distances of a path are sampled, the same for all five paths
+    c           the colour by which distances are sampled, the same for a base path and its four shifted copies
     τ           optical depth of the homogeneous media of a segment
     T           exp(-τ)
 

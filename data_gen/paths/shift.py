@@ -1,7 +1,7 @@
 """Shift mappings of gradient-domain path tracing: pure functions, each for one vertex.
 
-A shift maps a base path through one pixel to an offset path through its neighbour. At each vertex it does one of four
-things (survey, sections 3.1 to 3.3):
+A shift maps a base path through one pixel to an offset path through its neighbour. At each vertex the shift does one of
+four things (survey, sections 3.1 to 3.3):
 
     reconnect   go straight to the next vertex of the base path, which both paths share from then on
     replay      sample the next direction from the same random numbers
@@ -35,19 +35,19 @@ def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bo
 def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
     """Whether the reverse shift would undo the replay of an event.
 
-    It would not if it reconnected the base path's vertex to the next vertex of the offset path, whose event is of
-    ``offset_kind``. Otherwise it replays, whatever the kinds of the two events: the same random numbers have the same
-    density (survey, eq. 6).
+    The reverse shift would not undo it if it reconnected the base path's vertex to the next vertex of the offset path,
+    whose event is of ``offset_kind``. If it does not reconnect, it replays too, whatever the kinds of the two events,
+    because the same random numbers have the same density (survey, eq. 6).
     """
-    # The rule above with the two paths exchanged, as the reverse shift applies it
+    # The reverse shift applies the rule of ``reconnects`` with the two paths exchanged.
     return ~reconnects(offset_kind, offset, offset_next, base)
 
 
 def keeps_joined(kind: mi.UInt32) -> mi.Bool:
     """Whether a path that has come to the shared vertex from another direction may leave it as its companion does.
 
-    It may if the event there is smooth. A mirror or a hole gives each incoming direction its own outgoing one, so
-    neither path can sample the other's direction, and the shift is rejected from both sides.
+    It may if the event at the shared vertex is smooth. A mirror or a hole gives each incoming direction its own
+    outgoing one, so neither path can sample the other's direction, and the shift is rejected from both sides.
     """
     return kind == SMOOTH
 
@@ -72,7 +72,8 @@ def reconnection_jacobian(
 def copy_half_vector(
     wi: mi.Vector3f, wo: mi.Vector3f, η: mi.Float, wi_offset: mi.Vector3f, same: mi.Bool
 ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
-    """The direction that has with ``wi_offset`` the same half-vector as ``wi`` and ``wo``; dω'/dω; whether it exists.
+    """Returns the direction whose half-vector with ``wi_offset`` is that of ``wi`` and ``wo``; dω'/dω; and whether it
+    exists.
 
     Directions are in the shading frame of their vertex and lead away from it. ``η`` is the relative index of refraction
     along ``wo``. A refraction is copied only to the ``same`` material from the same side, since the reverse shift must
@@ -104,6 +105,6 @@ def copy_half_vector(
     J = dr.select(bends, length2_offset / length2 / cosines, cosines)
     wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
     exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
-    # If wi and wo are no refraction about h, the copy has no inverse.
+    # If the pair wi, wo is not a refraction about h, the copy has no inverse.
     exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
     return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists

@@ -3,8 +3,8 @@
 There are two kinds of ``points``. "independent" points come from a random number generator for each sample. "sobol"
 points, the default, come from Owen-scrambled Sobol sequences, with a new pair of dimensions for each pair of numbers.
 
-- A pair of dimensions is the first two of Sobol's sequence, with a new scrambling of the order of the points and of
-  both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
+- Each pair of dimensions uses the first two dimensions of Sobol's sequence, with a new scrambling of the order of the
+  points and of both coordinates. [Burley 2020, "Practical Hash-based Owen Scrambling"]
 - Pixels are numbered in Z order within tiles of 64x64, and the points of a pixel follow each other. Tiles are
   independent of each other. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via
   hierarchical ordering of pixels"]
@@ -46,8 +46,9 @@ def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 
     """A sampler whose lanes are the streams of sample ``sample`` of pixel ``pixel``.
 
     ``seed`` is an integer from 0. With a ``net`` above 0, the numbers are points in an image of this ``width``, and the
-    first round has ``net`` samples of each pixel, a power of two. With ``net`` 0 they are independent. Mitsuba's own
-    sampler depends on the number of the lane in its pass, so there the image would change with the size of passes.
+    first round has ``net`` samples of each pixel, a power of two. With ``net`` 0 they are independent. The numbers of
+    Mitsuba's own sampler depend on the number of the lane in its pass, so the image would change with the size of
+    passes.
     """
     if not net:
         return _independent(seed, pixel, sample)
@@ -211,7 +212,8 @@ def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
 
 
 def _owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling of the integer ``x``. It maps each aligned block of 2^n integers to such a block."""
+    """Nested uniform scrambling of the integer ``x``. It maps each aligned block of 2^n integers to an aligned
+    block."""
     return _reversed_owen(dr.brev(x), seed)
 
 

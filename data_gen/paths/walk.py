@@ -65,7 +65,8 @@ class Limits:
 
 
 def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
-    """Russian roulette: the probability of survival, by which survivors must be divided; 1 where ``plays`` is false.
+    """Russian roulette: the probability of survival, by which the weight of a survivor must be divided. It is 1 where
+    ``plays`` is false.
 
     For a path from the camera, ``throughput`` is the largest channel of its weight after the step, and ``η`` the
     product of the relative indices of refraction so far. η² undoes the change of radiance by refraction, as in
