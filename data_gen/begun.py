@@ -1,7 +1,7 @@
 """Unfinished renders: whether a file has all that was requested, and what is left to render.
 
 What is left (the rest) gets its own seed, derived from the requested seed and the number of parts that exist. So the
-samples of the rest are independent of those in the file, and the two are merged like any stacks with different seeds
+samples of the rest are independent of those in the file, and both parts are merged like any stacks with different seeds
 (``ngpt.merging``).
 """
 

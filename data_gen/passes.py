@@ -175,8 +175,8 @@ def render_passes(
         now, wall = budget.clock(), time.perf_counter() - wall
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
-        # Kernels report their compilation in wall-clock seconds, but the budget may use another clock. So not the
-        # seconds but their share of the pass is subtracted.
+        # Kernels report their compilation in wall-clock seconds, but the budget may use another clock. So the share of
+        # the wall-clock time that compilation takes is subtracted from the pass.
         done.append((n, max((now - begin) * (1 - sum(compiled) / max(wall, 1e-9)), 1e-6)))
         watch.look(film)
         now = budget.clock()

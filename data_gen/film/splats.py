@@ -30,7 +30,7 @@ class Splats:
         self.pixels = pixels
         self.channels = channels
         # Ordered by pixel, then by range from the smallest up, then by channel. So the channels of a range are adjacent
-        # in memory, where a splat spends most of its time.
+        # in memory, because memory access takes most of the time of a splat.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 

@@ -27,7 +27,7 @@ class Celled(Protocol):
     """Samples whose places in their pixels are known, such as ``data_gen.paths.camera.CameraSamples``."""
 
     def cells(self, k: int) -> mi.UInt32:
-        """Which of the K x K subpixels of its pixel each sample is in, counted row by row."""
+        """The number of each sample's subpixel among the K x K subpixels of its pixel, row by row."""
 
 
 @dataclass

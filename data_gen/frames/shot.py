@@ -156,7 +156,8 @@ def render_shot(
     frame one step earlier, which is not rendered; all NaN if there is no such frame. Motion refers to the whole
     picture; crop windows may show another part of it in each frame. Each frame has its own seed, so its bits do not
     depend on which other frames are rendered. Only the cache of tails has the same ``seed`` in all frames, because its
-    smooth noise would flicker. Errors are as in ``render_stack``; cameras without a projection raise NgptError.
+    smooth noise would flicker if it changed from frame to frame. Errors are as in ``render_stack``; cameras without a
+    projection raise NgptError.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the previous frames, up to ``warm_up`` of them where
     frames are skipped, and uses ``seed`` for all frames. If more than the camera changes, such a sampler also needs the

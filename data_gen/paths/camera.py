@@ -99,7 +99,7 @@ class CameraSamples:
         self.wavelength = self.random.next_1d()
 
     def cells(self, k: int) -> mi.UInt32:
-        """Which of the K x K subpixels of its pixel each sample is in, counted row by row.
+        """The number of each sample's subpixel among the K x K subpixels of its pixel, row by row.
 
         This uses the place in the pixel as it was drawn, because ``position`` includes the column and so has fewer
         digits.
