@@ -25,7 +25,8 @@ from data_gen.scenes.geometry import Geometry, Triangles, geometry, matrix
 from ngpt.errors import NgptError
 from ngpt.windows import Place
 
-# A hit that is farther off the straight ray than this, relative to the path's length, was seen by a mirror or a lens.
+# A hit that is farther off the straight ray than this, relative to the path's length, was seen in a mirror or through
+# glass.
 _OFF_RAY = 1e-3
 
 

@@ -27,8 +27,9 @@ class CameraSamples:
     numbers, which correlates a path with its shifted copies.
 
     ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0 for independent samples.
-    ``some``, UInt32, lists the pixels to sample, which may repeat; then ``first`` is a UInt32 with a number for each.
-    Functions that are recorded once (``data_gen.paths.frozen``) may use only those fields that ``DRJIT_STRUCT`` names.
+    ``some``, UInt32, lists the pixels to sample, which may repeat; then ``first`` is a UInt32 with a sample number for
+    each entry of ``some``. Functions that are recorded once (``data_gen.paths.frozen``) may use only those fields that
+    ``DRJIT_STRUCT`` names.
     """
 
     DRJIT_STRUCT = dict.fromkeys(
@@ -72,7 +73,8 @@ class CameraSamples:
 
     @classmethod
     def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
-        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film, drawn in the kernel that uses it."""
+        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film. Its random numbers are drawn in the
+        kernel that uses them."""
         camera = cls.__new__(cls)
         camera.pixel = pixel
         camera._see(sensor)

@@ -113,7 +113,8 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
     crossing = mi.Bool(active)
     while dr.hint(crossing, label="transmittance"):
         hit = trace(ray, medium, crossing)
-        # A ray shortened so as not to meet its target still crosses the medium over its full length.
+        # The ray may be a little shorter than ``reach``, so that it does not meet its target. Its light still crosses
+        # the medium over the full length.
         τ += depth(extinction(medium, ray), dr.select(hit.is_valid(), hit.t, reach))
         crossing &= hit.is_valid() & passes(hit.shape)
         if crossing:
@@ -122,7 +123,8 @@ def cross(passes, trace, ray, medium, reach, *, active, target):
 
 
 def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tuple:
-    """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary; an estimate in grids.
+    """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary. In grids, T is an
+    estimate.
 
     Returns T, the hit, the last piece of the ray, and the medium there.
     """

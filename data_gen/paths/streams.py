@@ -78,7 +78,8 @@ def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False)
     """Independent generators, one for each (a, b)."""
     entropy = [seed, 2] if of_lights else seed
     keys = (int(key) for key in np.random.SeedSequence(entropy).generate_state(2))
-    # Encrypted twice, so that the streams of two seeds do not differ only by a shift of some pixels or samples.
+    # The pair is encrypted twice. If it were encrypted once, the streams of two seeds could differ only by a shift of
+    # some pixels or samples.
     a, b = mi.sample_tea_32(a, b)
     a, b = mi.sample_tea_32(*(half ^ dr.opaque(mi.UInt32, key) for half, key in zip((a, b), keys, strict=True)))
     random = mi.PCG32()
@@ -225,7 +226,7 @@ def _pascal(x: mi.UInt32) -> mi.UInt32:
 
 
 def _apart(x: mi.UInt32) -> mi.UInt32:
-    """The bits of ``x``, up to 8, each with a gap behind it."""
+    """Spreads the bits of ``x``, up to 8, with a 0 between neighbours."""
     for shift, kept in ((4, 0x0F0F), (2, 0x3333), (1, 0x5555)):
         x = (x | x << shift) & kept
     return x
