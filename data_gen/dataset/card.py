@@ -14,7 +14,7 @@ from ngpt.system.files import atomic_output
 from ngpt.training.dataset import Dataset, ShardCrop, summary
 
 CELLS = 24  # crops on the contact sheet, evenly spaced in the set
-COLUMNS = 4  # each shows its noisiest input and its reference
+COLUMNS = 4  # cells in a row; each cell shows the noisiest input of a crop beside its reference
 
 
 def write_card(folder: Path) -> None:
@@ -31,7 +31,7 @@ def write_card(folder: Path) -> None:
 
 
 def contact_sheet(data: Dataset) -> np.ndarray:
-    """(H, W, 3) uint8: the ``shown`` images of some crops, with the automatic exposure of the second image."""
+    """(H, W, 3) uint8: two images of each of some crops, see ``shown``, with the automatic exposure of the second."""
     pairs = []
     for index in np.unique(np.linspace(0, len(data) - 1, min(CELLS, len(data))).astype(int)):
         images = shown(data[int(index)])
@@ -66,7 +66,10 @@ def card(data: Dataset, facts: dict) -> str:
             f"{config['reference_method']}."
         )
     else:
-        what, how = "halves", f"No references: the two inputs of a crop, by {sampler}, judge each other."
+        what, how = (
+            "halves",
+            f"No references: each of the two inputs of a crop, rendered by {sampler}, is the target of the other.",
+        )
     lines = [
         "# Training set",
         "",

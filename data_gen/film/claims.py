@@ -1,4 +1,4 @@
-"""The variance of pixels whose samples are points of nets, and so not independent.
+"""The variance of pixels whose samples are points of low-discrepancy nets, and so not independent.
 
 Samples of a pixel that are points of one net (``data_gen.paths.streams``) are spread more evenly than independent
 samples. The sample variance assumes independent samples, so it overstates the noise of the mean. The render itself
@@ -7,13 +7,13 @@ samples with mean a and n2 samples with mean b. The parts are compared by their 
 
     (b - a) sqrt(n1 n2) / n,
 
-whose expected square is the variance of the pixel's mean if samples are independent. Points of nets help much where
-little light is found by chance, and not at all where all of it is found by chance. So there is a family of laws by
-which the noise may fall, and ``data_gen.film.nets.law`` gives the expected square and the variance of the mean for each
-law. One square says little about a pixel, but pixels of about the same noise together show which law holds. A group in
-which few pixels have most of the noise shows this less clearly. So the factor for the variance is a mean over all laws,
-weighted by their probabilities. It is a geometric mean, since errors of factors are ratios. For pixels with two
-samples, all laws expect the same contrast, so only the prior of each law counts.
+whose expected square is the variance of the pixel's mean if samples are independent. Points of nets help much where the
+integrand is mostly smooth, and not at all where all light comes from rare random hits. So there is a family of laws for
+how fast the noise falls with the number of samples, and ``data_gen.film.nets.law`` gives the expected square and the
+variance of the mean for each law. One square says little about a pixel, but pixels of about the same noise together
+show which law holds. A group in which few pixels have most of the noise shows this less clearly. So the factor for the
+variance is a mean over all laws, weighted by their probabilities. It is a geometric mean, since errors of factors are
+ratios. For pixels with two samples, all laws expect the same contrast, so only the prior of each law counts.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
     """The factor (H, W, 1) by which the sample ``variance`` of the mean must be multiplied.
 
     ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN are not used.
-    ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in the first round.
+    ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in its first net.
     """
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)
-    # The pixel itself is left out: its own variance is large where it has a rare sample, and rare samples are the
-    # independent ones. Groups by a pixel's own variance would put all pixels with rare samples into one group.
+    # The pixel itself is left out. A rare bright sample makes the pixel's own variance large, and light from rare
+    # samples gains nothing from nets. Groups by a pixel's own variance would put all such pixels into one group.
     filled = np.where(good, variances, 0)
     sums = _AROUND**2 * box_means(filled, _AROUND)
     around = np.where(good, np.maximum(sums - filled, 0), np.inf).ravel()
@@ -81,9 +81,9 @@ def _likely(ratio: float, expected: np.ndarray, contrasts: float, pixels: float)
     are the ratios that the laws predict.
 
     A sample variance is a mean over ``contrasts`` orthogonal contrasts, and the observed contrast is one of them.
-    Divide the square of the observed contrast by the mean square of the other contrasts, and by the value that a law
-    expects for this ratio. The result has an F distribution. Its degrees of freedom are 1 and the number of other
-    contrasts, for each of the ``pixels`` of equal noise.
+    Let q be the squared observed contrast over the mean square of the other contrasts. Under a law, q divided by the
+    value that the law expects has an F distribution with 1 and ``contrasts`` - 1 degrees of freedom. There are
+    ``pixels`` such values: the effective number of pixels, as if all had equal noise.
     """
     others = contrasts - 1
     if others < 1e-6:

@@ -1,4 +1,4 @@
-"""The camera as an end of paths, including paths that start at a light."""
+"""The camera as an endpoint of paths: paths start at it, or start at a light and are connected to it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ class ThinLens:
 
     radius: mi.Float
     focus: mi.Float
-    # The place on the film, in [0, 1]² of the crop window, is ``scale`` (x, y) / z + ``shift`` in the camera's space.
+    # A point (x, y, z) in the camera's space is seen on the film at ``scale`` (x, y) / z + ``shift``; [0, 1]² is the
+    # crop window.
     scale: mi.Vector2f
     shift: mi.Vector2f
 
@@ -35,7 +36,7 @@ class ThinLens:
         return cls(radius, focus, mi.Vector2f(sx, sy), mi.Vector2f(x, y))
 
     def on_lens(self, lens: mi.Point2f) -> mi.Point3f:
-        """The point in the camera's space of ``lens``, a place in [0, 1]²."""
+        """Maps ``lens``, a place in [0, 1]², to a point on the lens, in the camera's space."""
         disk = mi.warp.square_to_uniform_disk_concentric(lens) * self.radius
         return mi.Point3f(disk.x, disk.y, 0)
 
@@ -80,7 +81,7 @@ class Eye:
         sensor = camera.sensor
         numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
         planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
-        # Spectral variants do not need the copy: they record no function once. Its rays would also lack wavelengths.
+        # Spectral variants do not need the copy, because they never freeze functions. Its rays would lack wavelengths.
         thin = ThinLens.of(sensor) if camera_name(sensor) == "thinlens" and not mi.is_spectral else None
         return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area, thin)
 
@@ -108,9 +109,9 @@ class Eye:
 
         ``uv`` of the sample is the place on the film, in pixels. ``p`` is the point on the near plane where the camera
         ray begins. ``pdf`` is 1 if ``si`` is in the camera's view, else 0; occlusion is ignored. W = 1 / (A cos³), with
-        A the film's area at distance 1. Mitsuba's own values are not used: in version 3.9 the importance is 0 in the
-        part of the film that an offset of the principal point adds, and the thin lens sees things before the near
-        plane.
+        A the film's area at distance 1. Mitsuba's own values are not used: in version 3.9 the importance is
+        wrongly 0 in the part of the film that only an offset of the principal point brings into view, and the thin lens
+        sees objects nearer than the near plane.
         """
         if self.thin:
             to = self.thin.toward(self.sensor.world_transform(), si, lens, mi.Vector2f(self.size))

@@ -26,7 +26,7 @@ _MOST = 0.95
 class Limits:
     """The parameters that our integrators share with Mitsuba's ``path``."""
 
-    max_depth: int = UNLIMITED  # most edges of a path; 1: only emission that the camera sees
+    max_depth: int = UNLIMITED  # the largest number of edges of a path; with 1, only emission that the camera sees
     rr_depth: int = 5  # number of the first vertex with Russian roulette
     hide_emitters: bool = False  # whether emitters are hidden from the camera
 
@@ -89,8 +89,8 @@ def brightest(paths: Iterable[Any]) -> mi.Float:
 class Sky:
     """Whether a path that escapes sees the environment.
 
-    An environment that is hidden from the camera is also hidden behind holes, because a path through them has not been
-    scattered yet.
+    An environment that is hidden from the camera stays hidden behind surfaces that a path passes straight through
+    (null events), because such a path has not been scattered yet.
     """
 
     seen: mi.Bool
@@ -101,7 +101,10 @@ class Sky:
         return cls(dr.full(mi.Bool, not hides, lanes))
 
     def behind(self, kind: mi.UInt32, found: mi.Bool | bool = True) -> Sky:
-        """For the edge after an event of this ``kind`` (``vertex.event_kind``), where one was ``found``."""
+        """The state for the edge that follows an event of this ``kind`` (``vertex.event_kind``).
+
+        ``found`` says in which lanes there was an event.
+        """
         return Sky(self.seen | (found & (kind != NULL)))
 
     def meets(self, x: mi.SurfaceInteraction3f) -> mi.Bool:

@@ -239,7 +239,10 @@ def show(report: dict, as_json: bool) -> None:
 
 
 def _fields(text: str) -> object:
-    """The fields that are set in a render's request, from its text in a header; the text itself if it is no request."""
+    """The fields that are set in a render request, parsed from its text in a header.
+
+    Returns the text unchanged if it is not a request.
+    """
     try:
         fields = parse_json(text, REQUEST)
     except NgptError:

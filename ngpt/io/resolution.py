@@ -1,8 +1,8 @@
 """Finds the layers of the contract (``ngpt.layers``) among the channel names of a file (``ngpt.io.aliases``).
 
-No file is opened here. OpenEXR calls channel ``C`` of layer ``L`` ``L.C``. Names of layers may contain dots and spaces:
-``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer ``ViewLayer.Denoising Albedo``. A name fits a layer if it
-is the whole name of the layer, or the end of that name after a dot.
+No file is opened here. In OpenEXR, channel ``C`` of layer ``L`` has the name ``L.C``. Names of layers may contain dots
+and spaces: ``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer ``ViewLayer.Denoising Albedo``. A name fits a
+layer if it is the whole name of the layer, or the end of that name after a dot.
 """
 
 import re
@@ -13,8 +13,8 @@ from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.aliases import ALIASES, LOOKS, NO_LIGHT, NOISE, NOT_LOOKS, OWN, Alias, plain
 from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
-# The name of each part of a file, and its channels: their names, or a mapping from the names to search to the names in
-# the file (``ngpt.io.views``)
+# The name of each part of a file, and its channels. These are a list of names, or a mapping whose keys are the names
+# that are searched and whose values are the names in the file (``ngpt.io.views``).
 Parts = Sequence[tuple[str, Sequence[str] | Mapping[str, str]]]
 
 _COLOUR = (("R", "r", "red"), ("G", "g", "green"), ("B", "b", "blue"))
@@ -69,10 +69,11 @@ def resolve(
 
     ``parts``      each part's name and its channel names
     ``overrides``  names of the contract -> the name of a layer in the file, whole or its end after a dot; or channels
-                   with signs and factors, "-velocity.R,velocity.G". These layers are not searched by aliases
+                   with signs and factors, "-velocity.R,velocity.G". Aliases are not tried for these layers
     ``path``       the name of the file for messages
-    ``writer``     the program that wrote the file, as ``writer_of`` finds it. If it is not "ngpt", ``direct``,
-                   ``caustic`` and the other names in ``OWN`` count only beside layers that no other program writes
+    ``writer``     the program that wrote the file, as ``writer_of`` finds it. If it is not "ngpt", a layer
+                   called ``direct``, ``caustic`` or another name in ``OWN`` is accepted only if the file also has a
+                   layer that only ngpt writes
     ``origin``     in a result file, the layer that the input was read from
 
     A channel without a dot belongs to the root; in a file of several parts, it belongs to the layer named like its
@@ -112,7 +113,7 @@ def resolve(
             home = _home(groups, found["primal"], origin)
     primal = found["primal"]
     for name, other in found.items():
-        # The root of a file of several parts may be a part called `albedo`, which is not a primal.
+        # In a file of several parts, the first part is also the root. If that part is called `albedo`, it is no primal.
         if name != "primal" and "primal" not in overrides and other[:2] == primal[:2]:
             raise _no_primal(groups, path)
     for name, beside in OWN.items():
@@ -149,8 +150,8 @@ def propose(parts: Parts, found: Resolution) -> dict[str, str]:
     """Guesses layers of the contract that ``found`` lacks: layer -> its name in the file.
 
     The guesses are made from names, and the user decides: ``--layer albedo="NAME"`` accepts one. Each layer of the file
-    is proposed once. Motion is proposed by its channels. Their signs are right for vectors to the next frame with y up,
-    which most renderers write.
+    is proposed once. Motion is proposed as channels with signs, such as "-X,Y". The signs are right for vectors that
+    point to the next frame with y up, which most renderers write.
     """
     taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
     proposed: dict[str, str] = {}
@@ -267,7 +268,7 @@ def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: st
 
 
 def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
-    """The parts and names of the channels with this name; if there are none, of the channels whose name ends in it."""
+    """The (part, name) of each channel with this name; if no channel has it, of those whose names end with it."""
     names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
     whole = {place for place, name in names.items() if channel in (name, place[1])}
     return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}

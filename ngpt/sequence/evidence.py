@@ -8,9 +8,9 @@ from ngpt.system.late import ndimage
 
 # The standard deviation, in pixels, of the Gaussian window of the evidence.
 WINDOW = 4.0
-# The standard deviation of b around the b of the variances, without any evidence.
+# Before any evidence is seen, b is assumed to lie within this standard deviation of the b that the variances give.
 DOUBT = 0.12
-# Differences of features beyond the allowed difference, at which history has exp(-1) = 0.37 of its weight.
+# If a feature differs by this much more than is allowed, the weight of history falls to exp(-1) = 0.37.
 ALBEDO, NORMAL, DEPTH = 0.1, 0.2, 0.03
 # The scale of the allowed difference. If two surfaces share a pixel in parts u and 1 - u, its features have a standard
 # deviation of sqrt(u (1 - u) / spp) times the difference of both surfaces.
@@ -26,8 +26,8 @@ class Evidence:
     ``noise``   (H, W, 3), the variance of the primal around each pixel, positive
     ``rest``    (H, W, 3), primal - x, clamped to 4 standard deviations of that noise
     ``best``    (H, W), b*; 0 where h = x
-    ``weight``  (H, W), the weight of b* in its mean with the b of the variances, 0 to 1
-    ``share``   (H, W), the resulting b, from 0 to the b of the variances
+    ``weight``  (H, W), the weight of b* when it is averaged with the b that the variances give, 0 to 1
+    ``share``   (H, W), the resulting b, from 0 to the b that the variances give
     """
 
     noise: np.ndarray
@@ -62,7 +62,7 @@ def weighed(
 
     ``variance``  (H, W, 3), the variance of p: NaN where it is unknown, None if it is unknown everywhere
     ``trust``     (H, W), the ``agreement`` of features
-    ``first``     (H, W), the b of the variances
+    ``first``     (H, W), the b that the variances give
     """
     rest, change = p - x, h - x
     if variance is None:
@@ -104,11 +104,11 @@ def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
 
 
 def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
-    """d: the share of its own noise that a method leaves in a pixel, from 0 (smooth) to 1 (the noisy image itself).
+    """d: the share of a pixel's own noise that the method leaves in the result, from 0 (smooth) to 1 (the noisy image).
 
-    For a projection, E (p - x)² = σ² (1 - d). It is more if x is biased, so this estimate of d is a lower bound. It is
-    the median over pixels where history has weight: elsewhere, as on newly visible surfaces, a method may leave another
-    share.
+    If the method is a projection, E (p - x)² = σ² (1 - d). A bias of x makes E (p - x)² larger, so this estimate of d
+    is a lower bound. The estimate is the median over pixels where history has weight: elsewhere, as on newly visible
+    surfaces, a method may leave another share.
     """
     ratio = _mean((np.square(rest) / noise).mean(axis=-1))
     trusted = ratio[trust > 0.5]

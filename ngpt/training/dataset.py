@@ -107,7 +107,7 @@ class ShardCrop:
         """(H, W, 3) float32: the converged image with directly visible emission. Raises NgptError for a pair."""
         if self.paired:
             raise NgptError(
-                f"{self.shard.path}: crop {self.index} is a pair: it has no reference, its inputs are halves"
+                f"{self.shard.path}: crop {self.index} is a pair: no reference, its inputs are halves of the samples"
             )
         return self.shard.crop("reference_indirect", self.index) + self.reference_direct + self.reference_caustic
 
@@ -203,7 +203,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
                 check(crop["frame"], int, f"{path}: 'frame' of a crop of {entry['file']!r}")
         name = PurePosixPath(entry["file"])
         if name.is_absolute() or ".." in name.parts or "\0" in entry["file"]:
-            raise NgptError(f"{path}: lists {entry['file']!r}, which is not in its folder; do not trust this file")
+            raise NgptError(f"{path}: lists {entry['file']!r}, which is outside its folder; do not trust this manifest")
     return manifest
 
 
@@ -230,7 +230,9 @@ def problems(folder: Path) -> list[str]:
         for i, crop_entry in enumerate(entry["crops"]):
             read = ShardCrop(shard, i, entry["scene"], tuple(crop_entry["spp"]))
             for k in filter(read.strays, range(read.inputs)):
-                found.append(f"{shard.path}: the subpixels of crop {i}, input {k} are of another image; make it again")
+                found.append(
+                    f"{shard.path}: the subpixels of crop {i}, input {k} do not match its pixels; make this shard again"
+                )
         if entry["crops"] and shards.REFERENCES[0] not in shard.names:
             one, other = shard.tensor("indirect").swapaxes(0, 1)
             for crop in np.flatnonzero((one == other).all(axis=(1, 2, 3))):
@@ -265,7 +267,9 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
     shape = shard.shape("indirect")
     if len(shape) != 5 or 0 in shape or any(len(crop["spp"]) != shape[1] for crop in crops):
-        raise NgptError(f"{path}: tensor 'indirect' is {shape}, and its crops have {len(crops[0]['spp'])} inputs")
+        raise NgptError(
+            f"{path}: tensor 'indirect' is {shape}; it must have 5 axes, with {len(crops[0]['spp'])} inputs"
+        )
     inputs, height, width = shape[1:4]
     if pairs and not (inputs == 2 and gradients):
         raise NgptError(f"{path}: has no references, so its crops must be pairs: 2 inputs with gradients, not {inputs}")
@@ -279,13 +283,14 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         expected = (len(crops), *shapes.get(name, (height, width, 3)))
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
-        if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):
-            raise NgptError(f"{path}: tensor '{name}' is of type {shard.type(name)}; it must be of (half) floats")
+        types = ("I32",) if name == "spp" else ("F16", "F32")
+        if shard.type(name) not in types:
+            raise NgptError(f"{path}: tensor '{name}' is of type {shard.type(name)}, it must be {' or '.join(types)}")
     return shard
 
 
 def summary(folder: Path) -> dict[str, Any]:
-    """The facts of a training set for ``ngpt info``; ``problems`` are the faults."""
+    """The facts of a training set that ``ngpt info`` prints. The entry ``problems`` lists its faults."""
     data = Dataset(folder)
     entries = data.manifest["shards"]
     crops = [crop for entry in entries for crop in entry["crops"]]

@@ -156,7 +156,7 @@ def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, given, monkeypatch)
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m, e: e.update(file="/etc/passwd"), "lists '/etc/passwd', which is not in its folder"),
+        (lambda m, e: e.update(file="/etc/passwd"), "lists '/etc/passwd', which is outside its folder"),
         (lambda m, e: e.pop("sha256"), r"manifest\.json: 'shards'\[0\]: lacks 'sha256'"),
         (lambda m, e: e["crops"][0].update(spp="many"), r"'crops'\[0\]: 'spp' is 'many'; it must be a list"),
         (lambda m, e: e.update(bytes=10**400), r"'bytes' is 1000.*; it must be int"),
@@ -205,7 +205,11 @@ def test_changed_shards_are_not_trained_on(folder, capsys, change, message):
     ("name", "change", "message"),
     [
         ("dx", lambda t: t["dx"][:, :1], r"tensor 'dx' is \(6, 1, 8, 8, 3\), it must be \(6, 2, 8, 8, 3\)"),
-        ("indirect", lambda t: t["indirect"][0], r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
+        (
+            "indirect",
+            lambda t: t["indirect"][0],
+            r"tensor 'indirect' is \(2, 8, 8, 3\); it must have 5 axes, with 2 inputs",
+        ),
         ("albedo", lambda t: t["albedo"].astype("f8"), "tensor 'albedo' is of type F64"),
         ("motion", lambda t: t["motion"][..., :1], r"tensor 'motion' is \(6, 8, 8, 1\), it must be \(6, 8, 8, 2\)"),
         ("reference_halves", lambda t: t["indirect"][:, :1], r"'reference_halves' is \(6, 1, 8, 8, 3\), it must be"),

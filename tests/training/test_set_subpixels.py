@@ -99,8 +99,11 @@ def test_subpixels_of_another_image_are_a_problem(given, tmp_path, capsys, name)
     write_set(tmp_path, {"a": [given]})
     changed(tmp_path, lambda t: t.update({f"fine_{name}": t[f"fine_{name}"][:, :, :, ::-1]}))
     found = problems(tmp_path)
-    assert len(found) == 2 and "the subpixels of crop 0, input 1 are of another image; make it again" in found[1]
-    assert main(["info", str(tmp_path)]) == 1 and "of another image" in capsys.readouterr().out
+    assert (
+        len(found) == 2
+        and "the subpixels of crop 0, input 1 do not match its pixels; make this shard again" in found[1]
+    )
+    assert main(["info", str(tmp_path)]) == 1 and "do not match its pixels" in capsys.readouterr().out
 
 
 def layers_of_examples(folder, crop, *inputs):

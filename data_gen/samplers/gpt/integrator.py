@@ -18,25 +18,28 @@ times as much.
     C                 the contribution f m of a path that one of these two techniques finds
     Δ                 gradient sample: the sum of 2 w (C(y) |J| - C(x)) / p(x) over all lengths of paths and over both
                       techniques, which are shifted separately
-    a                 factor of a settled offset path (see below): radiance R that arrives later adds a R to Δ
+    a                 factor of a settled offset path (see below): radiance R that arrives later adds the product of
+                      a and R to Δ
     A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
-    rough, late       whether the light of a path belongs to the layer ``caustic``; this light is in neither L nor Δ:
-                      see data_gen.paths.caustic
+    rough             whether the path has scattered smoothly at a connectable vertex
+    late              whether it has since left a vertex by a mirror, glass or sharp gloss. Its light then belongs to
+                      the layer ``caustic`` and is in neither L nor Δ: see data_gen.paths.caustic
 
 An offset path is *apart* from its base path at first. Then it is *joined* for one step: both paths share a vertex, but
 arrive there from different directions. After this step it is *settled*: both paths are the same. Offset paths that have
 ended or were rejected are settled, too.
 
-If a base path ends while offset paths are apart, it walks on as a *ghost*, which contributes no light. The offset paths
-replay random numbers that the ghost does not use itself. So the light that they find counts in the differences of this
-pixel, with w = 1/2, as in random sequence replay. Rejecting these offset paths would double their variance.
+If a base path ends while offset paths are apart, it walks on as a *ghost*, which contributes no light. The ghost goes
+on drawing random numbers, only so that the offset paths can replay them. Both paths of a pair use the same numbers, so
+r = 1, and the light of these offset paths counts in the differences of this pixel with w = 1/2, as in random sequence
+replay. Rejecting these offset paths would double their variance.
 
 All paths begin in ``trace``; the rules of shifting are in ``data_gen.paths.shift``; ``plan`` decides which code a scene
 needs in its kernel. ``data_gen.paths.space`` knows whether a vertex is in a medium.
 
 Russian roulette looks at all five paths, which survive together, so that none of them is starved. Its probabilities are
-left out of r. This is right, because the weights of the two directions of a difference sum to one, whatever paths
-survive.
+left out of r. This is right: a difference of two pixels is sampled by a shift in either direction, and the weights of
+the two shifts sum to one, whatever paths survive.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
 sections 3 and 4.1]
@@ -160,14 +163,14 @@ def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f
     """Returns L of each sample: the mean of four estimates, one for each neighbour.
 
     Each estimate combines a base path of this pixel with an offset path that leads to this pixel from the neighbour's
-    sample of the same number. ``A`` is the base path's part; the neighbour's A + Δ is the offset path's part.
+    sample with the same index. ``A`` is the base path's part; the neighbour's A + Δ is the offset path's part.
     [Kettunen et al. 2015, section 5]
     """
     names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
     L = mi.Color3f(0)
     for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):
         back = names.index(next(name for name, shift in SHIFTS.items() if shift == (-x, -y)))
-        # The lane of the neighbouring pixel's sample of the same number, which is in the same block
+        # The lane of the neighbouring pixel's sample with the same index, which is in the same block
         neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, camera.block * (x + camera.size.x * y)))
         L += (a + dr.gather(mi.Color3f, A[back] + Δ[back], neighbour, active)) / 8
     return L
