@@ -97,7 +97,7 @@ def test_pairs(renderer, first_view, tmp_path):
         assert crop.paired and crop.spp[0] == crop.spp[1]
         a, b = (crop.stack(k) for k in range(2))
         assert not np.array_equal(a["primal"], b["primal"]) and np.all(a["dx_var"] >= 0)
-        with pytest.raises(NgptError, match="is a pair: it has no reference"):
+        with pytest.raises(NgptError, match="is a pair: no reference"):
             _ = crop.reference
 
 
