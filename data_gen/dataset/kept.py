@@ -1,9 +1,11 @@
-"""Compressed references without inputs. Each time a reference is used, its inputs are rendered again, with new noise.
+"""Files of compressed references (renders of many samples) without the noisy inputs of training.
 
-A file of references has the name and the record (scene, views, seeds, versions) of the shard in which they were made,
-and the images of each crop, compressed by lzma. A number x is stored as its sign and the integer n nearest to 64 log2
-|x|, with an error of at most 0.54 %. The numbers n of green, and the differences of red and blue from green, are stored
-as differences from pixel to pixel, with high and low bytes separated.
+Each time a reference is used, its inputs are rendered again, with new noise.
+
+A file of references has the same name and the same record (scene, views, seeds, versions) as the shard in which the
+references were made. It holds the reference images of each crop, compressed by lzma. A number x is stored as its sign
+and the integer n nearest to 64 log2 |x|, with an error of at most 0.54 %. The numbers n of green, and the differences
+of red and blue from green, are stored as differences from pixel to pixel, with high and low bytes separated.
 """
 
 from __future__ import annotations
@@ -38,7 +40,10 @@ class Again:
 
 
 def home(config: DatasetConfig, folder: Path) -> Path:
-    """The subfolder of ``folder`` for references of ``config``. Configurations that differ only in inputs share it."""
+    """The subfolder of ``folder`` for references of ``config``.
+
+    Configurations that differ only in their inputs share a subfolder.
+    """
     facts = {name: value for name, value in as_json(config).items() if name not in _OF_INPUTS}
     return folder / f"{zlib.crc32(json.dumps(facts, sort_keys=True).encode()):08x}"
 

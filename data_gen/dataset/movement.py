@@ -1,6 +1,7 @@
-"""Random movements of a shot of a training set: of its camera, of one thing in it, and of its light.
+"""Random movements in the shots (frame sequences) of a training set.
 
-Each of the three moves or rests independently. Its speed is constant in a shot, and log-uniform over shots.
+In each shot the camera may move, one thing may move, and the light may change. Every speed is constant in a shot, and
+log-uniform over shots.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from data_gen.dataset.cameras import CameraView, Surroundings, floats
 from data_gen.frames.motion import seen
 from data_gen.scenes.geometry import VERTICES, put_vertices, vertices
 
-# Shares of the shots in which the camera moves, a thing moves, and the light changes. If the light changes and there is
-# a lamp, the lamp moves with probability LAMP. Otherwise a radiance changes.
+# Shares of the shots in which the camera moves, a thing moves, and the light changes. If the light changes, no thing
+# moves and a lamp can be moved, then a lamp moves with probability LAMP. In all other cases of a changing light, a
+# radiance changes.
 CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
 # Movement per frame at the median distance, as a share of the image's width: 0.1 to 9.6 of 96 pixels.
 SPEEDS = 0.001, 0.1
@@ -31,7 +33,7 @@ RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
 
 @dataclass
 class Movement:
-    """The changes from frame to frame. With only a ``view`` nothing changes."""
+    """The changes from frame to frame. If only ``view`` is set, nothing changes."""
 
     view: CameraView
     way: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera, in world units per frame
@@ -72,7 +74,7 @@ class Movement:
 
 
 def random_movement(around: Surroundings, view: CameraView, rng: np.random.Generator, frames: int) -> Movement:
-    """A random movement for a shot of ``frames`` frames that starts at ``view``. It applies the view to the scene."""
+    """A random movement for a shot of ``frames`` frames that starts at ``view``. Also applies ``view`` to the scene."""
     scene = around.scene
     view.apply(scene)
     what = seen(scene)
@@ -123,10 +125,10 @@ def random_movement(around: Surroundings, view: CameraView, rng: np.random.Gener
 
 
 def _movable(scene: mi.Scene) -> dict[int, str]:
-    """The parameter that places a shape, by the number of the shape, for all shapes that can be moved."""
+    """For each shape that can be moved, by its number: the name of the parameter that places the shape."""
     places: dict[int, str] = {}
     numbers = {shape: number for number, shape in enumerate(scene.shapes())}
-    # By nodes and not by names, since shapes may have no name
+    # Shapes are recognised by their nodes and not by their names, since shapes may have no name
     for name, (_, _, node, _) in mi.traverse(scene).properties.items():
         kind = name.rpartition(".")[2]
         if node in numbers and (kind == "to_world" or (kind in VERTICES and numbers[node] not in places)):

@@ -14,12 +14,15 @@ _SHARP = ("SmoothConductor", "SmoothDielectric")
 _TINY = 1 / 500
 # Part of the class name of all emitters with a sun, whose disk fills 7e-5 of a hemisphere.
 _SUN = "Sunsky"
-# Below this mean cosine (2.6 degrees) vertex normals count as different from face normals.
+# Vertex normals count as different from face normals if the mean cosine between them is below this (2.6 degrees).
 _BENT = 0.999
 
 
 def behind_sharp(scene: mi.Scene) -> str:
-    """The kind of lamps that camera paths hardly meet behind the scene's glass or mirrors; "" if there are none."""
+    """The kind of the scene's lamps that camera paths hardly meet behind its glass or mirrors.
+
+    "" if the scene has no clear glass or mirrors, or no lamps of this kind.
+    """
     if not any(_is_sharp(shape.bsdf()) for shape in shapes_of(scene)):
         return ""
     if without_size(scene):
@@ -49,7 +52,7 @@ def has_holes(scene: mi.Scene) -> bool:
 def bent_lamp(scene: mi.Scene) -> mi.Shape | None:
     """The first lamp whose vertex normals differ from its face normals, or None.
 
-    Mitsuba computes a wrong density for such lamps: its issue 1952.
+    Mitsuba computes a wrong density for a lamp of this kind (Mitsuba's issue 1952).
     """
     return next(filter(is_bent, (shape for shape in scene.shapes() if shape.is_emitter())), None)
 

@@ -5,7 +5,7 @@ Before the first sample, Dr.Jit records every virtual call of a kernel for each 
 Within a mesh, points are sampled in proportion to the radiance.
 
 A lamp keeps its radiance and its material. It loses its name and its texture coordinates: u now holds the number of the
-lamp in its mesh, from which the radiance is looked up.
+lamp in its mesh, and this number is used to look up the radiance.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from data_gen.scenes.lamp_mesh import LampFaces, lamps, mesh_of
 from data_gen.scenes.lost import is_bent
 from data_gen.scenes.nodes import MESHES, added, is_part, parts_of
 
-# The least number of lamps of one material that are merged
+# Lamps of one material are merged if they are at least this many
 MANY = 256
-# How often the lamps are split into halves: this gives 64 meshes
+# How often the lamps of a material are split into halves; 6 times gives 64 meshes
 _HALVINGS = 6
 # The corners of Mitsuba's rectangle, and its faces
 _RECTANGLE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
@@ -78,7 +78,7 @@ def _register(variant: str) -> None:
 
 
 def _candidates(state: mi.parser.ParserState) -> Iterator[tuple[str, int | None, int, np.ndarray]]:
-    """Meshes that shine in one colour: name, material node (None: Mitsuba's default), mesh node, radiance."""
+    """Yields name, material node (None: Mitsuba's default), mesh node and radiance of each mesh with one radiance."""
     for name, number in parts_of(state.root.props):
         shape = state.nodes[number].props
         nodes = [part for _, part in parts_of(shape)]
@@ -132,7 +132,10 @@ def _lamp(shape: mi.Properties, radiance: np.ndarray) -> Lamp | None:
 
 
 def _halved(part: np.ndarray, middles: np.ndarray, times: int) -> Iterator[np.ndarray]:
-    """Splits ``part``, numbers of lamps, into parts that are close together. Each is in the order of the file."""
+    """Splits ``part`` (numbers of lamps) into groups of lamps that are close together.
+
+    Within each group, the lamps have the order of the file.
+    """
     if times == 0 or len(part) < 2:
         yield np.sort(part)
         return

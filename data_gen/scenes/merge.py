@@ -1,9 +1,9 @@
-"""Merges equal materials of a scene file, and meshes of one material.
+"""Merges equal materials of a scene file, and meshes that share a material.
 
 Dr.Jit records each shape as a separate case of its kernels before the first ray. This takes seconds for a room of 800
-meshes, and a tenth of that if meshes of one material are merged. Shapes keep the order of the file. A merged mesh has
-the place of the first of its meshes, and all of them lose their names. Meshes that bound a medium stay as they are. So
-do meshes that shine, unless there are many: see ``many_lamps``.
+meshes, and a tenth of that time if meshes of one material are merged. Shapes keep the order of the file. A merged mesh
+takes the place of the first of its meshes, and the names of all its meshes are lost. Meshes that bound a medium are not
+merged. Meshes that shine are merged only if they are many: see ``many_lamps``.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from data_gen.scenes.nodes import MESHES, added, parts_of
 
 # Settings of meshes that change normals
 _NORMALS = ("face_normals", "flip_normals")
-# The most bytes, over all copies, for which the instances of a group become meshes. Copies take memory, unlike
-# instances
+# The instances of a group are replaced by copies of its meshes if all copies together have at most this many bytes.
+# Unlike instances, copies take memory
 _MOST_BYTES = 1 << 24
 
 
 def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
-    """Merges the nodes of a parsed scene file. Files of meshes are found by Mitsuba's file resolver."""
+    """Merges the nodes of a parsed scene file. Mitsuba's file resolver finds the files of meshes."""
     # Exporters repeat a material in each shape. Equal materials are replaced by the first of them.
     mi.parser.transform_merge_equivalent(config, state)
     merge_lamps(state)
@@ -37,7 +37,7 @@ def merge(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> None:
             groups.setdefault(key, []).append(name)
     for names in groups.values():
         merged = _in_pairs(state, [scene[name] for name in names])
-        # Read again, since the list of nodes may have moved
+        # The root is read again, since the list of nodes may have moved in memory
         scene = state.root.props
         scene[names[0]] = merged
         for name in names[1:]:
@@ -67,7 +67,7 @@ def _copy_instances(state: mi.parser.ParserState) -> None:
 def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> None:
     """Replaces the instance called ``name`` by copies of ``meshes``."""
     instance = state.nodes[state.root.props[name].index()].props
-    # Read before nodes are added, since that moves the others
+    # This is read before nodes are added, since adding a node may move the other nodes in memory
     placed = [instance["to_world"]] if "to_world" in instance else []
     for i, number in enumerate(meshes):
         props = mi.Properties(state.nodes[number].props)
@@ -78,13 +78,16 @@ def _copy(state: mi.parser.ParserState, name: str, meshes: Sequence[int]) -> Non
 
 
 def _bytes_of(mesh: mi.Properties) -> int:
-    """The size of a mesh's file in bytes, or for a mesh without a file about its memory."""
+    """The size of a mesh's file in bytes. For a mesh without a file, a rough size in memory."""
     file = Path(str(mi.file_resolver().resolve(mesh["filename"]))) if "filename" in mesh else None
     return file.stat().st_size if file is not None and file.is_file() else 1 << 10
 
 
 def _in_pairs(state: mi.parser.ParserState, meshes: list) -> mi.Properties.ResolvedReference:
-    """Merges n meshes in pairs, so each is copied log2(n) times. One by one, the first would be copied n times."""
+    """Merges n meshes in pairs, so that each mesh is copied log2(n) times.
+
+    If meshes were added one by one, the first mesh would be copied n times.
+    """
     if len(meshes) == 1:
         return meshes[0]
     props, middle = mi.Properties("merge"), len(meshes) // 2
