@@ -24,7 +24,7 @@ from ngpt.subpixels import means, subpixels
 from ngpt.training.shards import CropData, write_shard
 from ngpt.version import __version__
 
-# The most views to try for a crop, since views may turn out black
+# The most views to try for a crop. A view may turn out black, and then another one is tried
 ATTEMPTS = 6
 # The number of independent parts of a reference. They have the same signal but different noise.
 HALVES = 2
@@ -34,8 +34,8 @@ LIT = 0.1  # the share of pixels of the first input that must have seen any ligh
 def make_shard(config: DatasetConfig, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
-    It can run in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
-    With ``again`` the references exist already, and only inputs are rendered, with new noise.
+    This function can run in any process. The same config and job give the same bits. A crop that fails is recorded and
+    left out. If ``again`` is given, the references exist already, and only inputs are rendered, with new noise.
     """
     if (Path(folder) / job.file).exists():  # a worker made it and died before it reported it
         return job.file
@@ -95,7 +95,7 @@ def made_scene(config: DatasetConfig, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: DatasetConfig) -> list[int]:
-    """Samples per pixel of the inputs: log-uniform, stratified, smallest first. The two numbers of a pair are equal."""
+    """Samples per pixel of each input: log-uniform, stratified, smallest first. Both inputs of a pair get the same."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
     if config.pairs:
         return 2 * [int(np.exp(low + rng.random() * (high - low)))]
@@ -106,7 +106,7 @@ def sample_counts(rng: np.random.Generator, config: DatasetConfig) -> list[int]:
 def uneven_inputs(config: DatasetConfig, name: str, crop: int, counts: list[int]) -> list[bool]:
     """Which inputs of a crop get adaptive samples: the share ``config.adaptive`` of the inputs with enough samples.
 
-    It uses separate random numbers, so that views, seeds and references are the same as with even samples.
+    The choice uses separate random numbers, so that views, seeds and references are the same as with even samples.
     """
     if not config.adaptive:
         return [False] * len(counts)
@@ -180,8 +180,9 @@ def make_crop(config: DatasetConfig, around, name: str, crop: int) -> list[tuple
 def make_inputs(
     config: DatasetConfig, scene, made: Any, kept: Kept, place: int, seed: int
 ) -> list[tuple[CropData, dict]]:
-    """The crop at ``place`` of kept references, and its record: the same view with new inputs, whose noise depends on
-    ``seed``.
+    """Renders new inputs for the crop at ``place`` in a file of kept references; returns the crop and its record.
+
+    The view is that of the references. The noise of the inputs depends on ``seed``.
     """
     from data_gen.dataset.cameras import CameraView
 
@@ -241,7 +242,7 @@ def _crop(
 
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """The clean image without the light of the layer ``caustic``, and that light, or None without such a layer."""
+    """The clean image without the light of the layer ``caustic``, and this light (None if the layer is missing)."""
     image = reconstruct(converged, method=method).image
     if "caustic" not in converged:
         return image, None
@@ -252,7 +253,7 @@ def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.nd
 
 
 def finite(stack: GradientStack) -> tuple[GradientStack, int]:
-    """The stack with all values made finite, and the number of pixels and differences that were not.
+    """The stack with all values made finite, and the number of pixels and differences that were not finite.
 
     Pixels are filled from their neighbours, and gradients become 0. An unknown variance becomes the square of the
     value, as if the value were only noise. Pixels stay the means of their subpixels.

@@ -99,7 +99,7 @@ class Stream:
             raise NgptError(f"the stream of crops has stopped: {self._error}") from self._error
 
     def _jobs(self) -> Iterator[tuple[Job, Again | None]]:
-        """The jobs, without end: all scenes in each turn. With kept references the order differs from run to run."""
+        """Yields jobs without end; each turn has all scenes. With kept references, the order differs in each run."""
         rng = np.random.default_rng()
         for turn in count():
             plan = self.config.plan(0 if self.kept else turn)
@@ -116,7 +116,7 @@ class Stream:
             while not self._stop.is_set():
                 while len(running) < ahead:
                     job, again = next(jobs)
-                    # A running job of the same name would write the same file.
+                    # Two running jobs with the same file name would write the same file, so the second is left out.
                     if job.file not in running.values():
                         given = (self.config, job, self._temporary.name, self.variant, again)
                         running[self.executor.submit(make_shard, *given)] = job.file

@@ -31,7 +31,10 @@ def warn_if_black(scene: mi.Scene, image: np.ndarray) -> None:
 
 
 def why_black(scene: mi.Scene) -> str:
-    """The reason why the image of the first sensor is black in a scene with lamps, judged by the hits of its rays."""
+    """The reason why the first sensor's image is black although the scene has lamps.
+
+    It is found by tracing random rays of this sensor.
+    """
     random, sensor = mi.PCG32(_RAYS, 0x1A3B), scene.sensors()[0]
     film, lens = (mi.Point2f(random.next_float32(), random.next_float32()) for _ in range(2))
     ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), film, lens)

@@ -1,4 +1,4 @@
-"""One emitter for many lamps that share a mesh, for ``many_lamps``."""
+"""An emitter that stands for many lamps in one mesh. ``many_lamps`` makes these meshes."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def lamps(table: LampFaces) -> mi.Emitter:
 
 
 def table_of(emitter: mi.Emitter) -> LampFaces | None:
-    """The table of an emitter with many lamps; None for all others."""
+    """The table of an emitter with many lamps; None for any other emitter."""
     table = getattr(emitter, "table", None)
     return table if isinstance(table, LampFaces) else None
 
 
 def is_area(emitter: mi.Emitter) -> bool:
-    """Whether an emitter is a surface that shines to its front; it may be one lamp or many."""
+    """Whether an emitter is a surface that shines to its front. The emitter may stand for one lamp or for many."""
     return table_of(emitter) is not None or emitter.class_name() == "AreaLight"
 
 
@@ -58,7 +58,7 @@ def mesh_of(props: mi.Properties) -> mi.Mesh:
 
 @cache
 def _emitter(variant: str) -> type:
-    """The class for a variant, which must be the current one, since each variant has its own base classes."""
+    """The emitter's class for a variant, which must be the current one. Each variant has its own base classes."""
 
     class Lamps(mi.Emitter):
         """Many area lamps of one mesh, each with its own radiance. They shine on the side to which their faces turn.
@@ -77,7 +77,7 @@ def _emitter(variant: str) -> type:
             strength = strength if strength.any() else np.ones(len(strength))
             share = areas * strength[lamp]
             upto = np.cumsum(share / share.sum())
-            # Above any random number, from the last face that may be sampled
+            # From the last face that may be sampled, the bound exceeds any random number, so no later face is chosen.
             upto[np.flatnonzero(share)[-1] :] = 2
             self.faces, self.upto = len(areas), mi.Float(upto.astype(np.float32))
             self.corners, self.lamp = mi.Float(corners.astype(np.float32).ravel()), mi.UInt32(lamp.astype(np.uint32))

@@ -20,7 +20,7 @@ from data_gen.scenes.merge import merge
 from data_gen.scenes.nodes import parts_of
 from ngpt.errors import NgptError, stop_if_interrupted
 
-# The number of threads that is enough to load any scene
+# With at least this many threads every scene finishes loading: see ``_enough_threads``
 _LOADING = 2
 
 
@@ -36,8 +36,9 @@ def load_scene(
 
     ``size`` is (width, height) in pixels and replaces the scene's film size; a crop window stays the same part of the
     film. ``parameters`` sets the file's ``<default>`` values. ``merged`` joins the meshes of each material into one.
-    The image is the same, and the render starts much sooner. It must be off if meshes move or are looked up by name. If
-    ``sensor``, a number or an id, is given, the scene has only this sensor. Raises NgptError with Mitsuba's message.
+    The image is the same, and the render starts much sooner. ``merged`` must be False if meshes move or are looked up
+    by name. If ``sensor`` (a number or an id) is given, a scene file is loaded with only this sensor. Raises NgptError
+    with Mitsuba's message.
     """
     parameters = parameters or {}
     try:
@@ -87,7 +88,7 @@ def check_scene(scene: object) -> mi.Scene:
 
 
 def complaint(error: Exception) -> str:
-    """Mitsuba's error about a scene, in one line. An unclear one is replaced."""
+    """Mitsuba's error about a scene, in one line. An unclear message is replaced by a clear one."""
     text = " ".join(str(error).split())
     if "<animation>" in text:
         return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
@@ -96,7 +97,7 @@ def complaint(error: Exception) -> str:
 
 @contextmanager
 def _enough_threads() -> Iterator[None]:
-    """A context with at least two threads. With one, some scene files never finish loading (Mitsuba 3.9.1)."""
+    """A context with at least two threads. With one thread, some files never finish loading (Mitsuba 3.9.1)."""
     before = dr.thread_count()
     if before >= _LOADING:
         yield
@@ -127,7 +128,7 @@ def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
 
 @contextmanager
 def at_most(scene: mi.Scene, pixels: int):
-    """Shrinks the scene's film to at most ``pixels`` within the block; yields the factor by which it shrinks.
+    """Shrinks the scene's film to at most ``pixels`` within the block; yields the old number of pixels / the new.
 
     A cropped film keeps its size, since its window could not be restored.
     """
@@ -146,7 +147,7 @@ def at_most(scene: mi.Scene, pixels: int):
 
 
 def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:
-    """Scales a part of a film of ``whole`` pixels to a film of ``new`` pixels. It keeps at least one pixel."""
+    """Scales a part of a film of ``whole`` pixels to a film of ``new`` pixels. The result has at least one pixel."""
     first, end = ((2 * int(edge) * new + int(whole)) // (2 * int(whole)) for edge in (begin, begin + length))
     first = min(first, new - 1)
     return first, max(end - first, 1)
@@ -189,8 +190,8 @@ def parsed(path: str, parameters: Mapping[str, str] = MappingProxyType({})) -> t
     """Mitsuba's configuration and state of a scene file that is parsed but not instantiated."""
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
-    # With parallel loading the numbers of objects differ from process to process, and so do kernels, which would be
-    # compiled again.
+    # With parallel loading, the numbers of objects differ from process to process. The kernels then differ too, and
+    # each process would compile them again.
     config.parallel = False
     state = mi.parser.parse_file(config, path, **parameters)
     mi.parser.transform_all(config, state)
