@@ -8,8 +8,8 @@ SCENES is the folder of scene files. Each row of SCENES_SHOWN is rendered with t
 the default method of `ngpt denoise`. References are rendered with whole paths, in two halves with other seeds. Renders
 are kept in the cache. The program writes docs/images/gallery, bench/results/gallery.json, and the table between the
 marks of the page. With --wipe it writes docs/images/wipe.webp: a line moves over the noisy image and uncovers the
-result. With --which it writes docs/images/which-sampler.webp: the scenes and samplers of WHICH beside path tracing,
-each image rendered for WHICH_SECONDS of processor time.
+result. With --which it writes docs/images/which-sampler.webp. This picture compares path tracing with the samplers of
+WHICH. Each of its images was rendered for WHICH_SECONDS of processor time.
 """
 
 import argparse
@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path(), help="folder of the scene files")
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only make these scenes again")
     parser.add_argument("--wipe", metavar="NAME", help="write only the moving picture of this scene")
-    parser.add_argument("--which", action="store_true", help="write only the picture of which-sampler.md")
+    parser.add_argument("--which", action="store_true", help="write only which-sampler.webp")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder for renders")
     args = parser.parse_args()
@@ -150,13 +150,18 @@ def rendered(
     file = args.cache / f"{name_of(row)}-{made_by}-{spp}-{seed}-{args.size[0]}x{args.size[1]}.exr"
 
     def make() -> GradientStack:
-        path = args.folder / row.scene if (args.folder / row.scene).exists() else row.scene
-        how = {"size": tuple(args.size), "unbiased": unbiased}
-        made, seconds = timed(lambda: data_gen.render_scene(path, spp, seed, sampler, **how, **options))
+        scene, how = scene_of(args, row.scene), {"size": tuple(args.size), "unbiased": unbiased}
+        made, seconds = timed(lambda: data_gen.render_scene(scene, spp, seed, sampler, **how, **options))
         made.stack.attributes["gallery:seconds"] = seconds
         return made.stack
 
     return kept(file, make)
+
+
+def scene_of(args: argparse.Namespace, name: str) -> Path | str:
+    """Returns the scene file in --folder. If there is none, ``name`` is a built-in scene or a path."""
+    file = args.folder / name
+    return file if file.exists() else name
 
 
 def table(found: dict[str, Any]) -> str:
@@ -188,11 +193,13 @@ def write_wipe(path: Path, before: np.ndarray, after: np.ndarray) -> None:
 
 
 def write_which(args: argparse.Namespace, path: Path) -> None:
-    """A row for each scene of WHICH: Mitsuba's path tracing, the same with OIDN, and the sampler with its method."""
+    """Writes a picture with one row for each scene of WHICH.
+
+    A row shows Mitsuba's path tracing, the same image denoised by OIDN, and the result of the sampler.
+    """
     rows = []
     for name, sampler in WHICH.items():
-        scene = args.folder / name if (args.folder / name).exists() else name
-        how = {"cpu_seconds": WHICH_SECONDS, "size": tuple(args.size)}
+        scene, how = scene_of(args, name), {"cpu_seconds": WHICH_SECONDS, "size": tuple(args.size)}
         paths, _ = data_gen.render_scene(scene, sampler="primal", unbiased=True, **how, **RIVAL)
         stack, _ = data_gen.render_scene(scene, sampler=sampler, **how)
         result = ngpt.reconstruct(stack)
@@ -200,10 +207,7 @@ def write_which(args: argparse.Namespace, path: Path) -> None:
         heads = ("Path tracing", "Path tracing, OIDN", f"{stack.attributes['ngpt:sampler']}, {result.method}")
         exposure = auto_exposure(result.image)
         rows.append(beside({head: to_srgb8(image, exposure) for head, image in zip(heads, shown, strict=True)}))
-    canvas = Image.new("RGB", (rows[0].width, sum(row.height for row in rows)), PAPER)
-    for i, row in enumerate(rows):
-        canvas.paste(row, (0, i * row.height))
-    written(path, [canvas], quality=88)
+    written(path, [Image.fromarray(np.vstack(rows))], quality=88)
 
 
 def beside(tiles: dict[str, np.ndarray]) -> Image.Image:

@@ -148,7 +148,7 @@ def usable(oidn: bool) -> Callable[[str], bool]:
 
 
 def used(method: str, layers: Container[str]) -> tuple[str, ...]:
-    """Those of the ``layers`` that a method uses, in the order of ``LAYERS``."""
+    """Returns the ``layers`` that a method uses, in the order of ``LAYERS``."""
     entry = METHODS[method]
     return tuple(name for name in LAYERS if name in layers and name in (*entry.needs, *entry.uses, *entry.estimates))
 

@@ -222,7 +222,10 @@ def worth_by_scene(size: Size) -> str:
 
 
 def by_method(sizes: list[Size]) -> str:
-    """Errors over those of OIDN on Mitsuba's samples, over all scenes, and the seconds of each reconstruction."""
+    """The table of methods: each error divided by OIDN's on Mitsuba's samples, and the seconds of a reconstruction.
+
+    Errors are geometric means over all scenes.
+    """
     size, rows = sizes[0], []
     for method in COMPARED:
         cells = [ratio(size.means.get((size.groups[-1], n, method, "mitsuba")), "error") for n in size.counts]

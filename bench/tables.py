@@ -10,7 +10,7 @@ and the cost of a sample of each sampler. ``PAGES`` has the page and the kind of
     by_scene   errors over the least error of the scene, which is bold; then the least errors, and the cost of a sample
                relative to `primal`
     means      geometric means over the scenes at each number of samples; the least is bold
-    rivals     errors over those of OIDN on our samples and on Mitsuba's; geometric means over all cells
+    rivals     errors divided by OIDN's error on our samples, and on Mitsuba's; geometric means over all cells
 """
 
 import argparse

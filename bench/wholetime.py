@@ -173,7 +173,7 @@ def grouped(
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """Group -> those of the ``scenes`` that are in it. If there are several scenes, "all" holds all of them."""
+    """Returns the ``scenes`` of each group. If there are several scenes, the group "all" holds all of them."""
     found = list(dict.fromkeys(scenes))
     groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
     return groups | ({"all": found} if len(found) > 1 else {})

@@ -21,7 +21,7 @@ CAMPAIGNS = "tests/campaigns"
 PAGE = ROOT / "docs" / "lab" / "RELIABILITY.md"
 
 # Campaigns of one kind share a row: what comes before one of these words is the kind
-KINDS = (" at random moments of ", " under ", " bytes: ")
+KINDS = (" at random moments of ", " under ")
 
 HEAD = """\
 # Reliability

@@ -182,7 +182,7 @@ def make_inputs(
 ) -> list[tuple[CropData, dict]]:
     """Renders new inputs for the crop at ``place`` in a file of kept references; returns the crop and its record.
 
-    The view is that of the references. The noise of the inputs depends on ``seed``.
+    Inputs and references have the same view. The noise of the inputs depends on ``seed``.
     """
     from data_gen.dataset.cameras import CameraView
 

@@ -53,13 +53,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def write(args: argparse.Namespace) -> list[Path]:
     """Writes the requested files and returns their paths."""
-    if args.output.suffix in (".tza", ".safetensors"):
-        from ngpt.export.weights import oidn_weights, write_halves
+    if args.output.suffix == ".tza":
+        from ngpt.export.weights import oidn_weights
 
-        if args.output.suffix == ".tza":
-            write_bytes(args.output, oidn_weights(args.weights[0]), args.force)
-        else:
-            write_halves(args.weights, args.output, args.force)
+        write_bytes(args.output, oidn_weights(args.weights[0]), args.force)
+        return [args.output]
+    if args.output.suffix == ".safetensors":
+        from ngpt.export.weights import write_halves
+
+        write_halves(args.weights, args.output, args.force)
         return [args.output]
     if not args.weights:
         from ngpt.export.poisson import l2_model

@@ -1,4 +1,4 @@
-"""Broken manifests, shards, weights, checkpoints, settings and networks: whole ones with something wrong with them.
+"""Breaks manifests, shards, weights, settings and networks: each function changes something in a whole one.
 
 Every change is drawn from a ``random.Random``, which Hypothesis provides: it tries many, and finds a small one that
 fails.

@@ -206,6 +206,18 @@ def test_the_cosine_schedule():
     assert [learning_rate(s, i, 10) for i in range(2)] == [1, 1] and learning_rate(s, 8, 11) < 1
 
 
+def test_settings_that_are_gone_do_not_stop_a_run(done, tmp_path):
+    """Checkpoints of earlier versions hold them."""
+    tensors, header = safetensors.read_tensors(done / "checkpoint.safetensors")
+    header["settings"]["run"]["wandb"] = ""
+    header["settings"]["augmentation"]["rarer"] = []
+    (tmp_path / "run").mkdir()
+    safetensors.write_tensors(tmp_path / "run" / "checkpoint.safetensors", tensors, header)
+    again = trainer(tmp_path / "run")
+    again.resume()
+    assert again.step == 12
+
+
 def test_a_run_says_what_has_changed_since_its_checkpoint(done):
     with pytest.raises(NgptError, match=r"another \[model\]"):
         trainer(done, model_units=[2, 1]).resume()

@@ -71,15 +71,17 @@ def partition(stage: Stage) -> None:
 
 def fixture(rng: np.random.Generator, radius: float) -> list[things.Part]:
     """The parts around a lamp of this ``radius``: none, a shade, a glass ball, or a ledge below it."""
-    kind = rng.integers(4)
-    if kind == 1:
+    kind = ("bare", "shade", "glass", "ledge")[rng.integers(4)]
+    if kind == "shade":
         # A shade that is open below, or above and below
         top, tall = rng.choice([0.001, rng.uniform(1.2, 2.0)]) * radius, rng.uniform(3, 6) * radius
         profile = [(rng.uniform(2.0, 4.0) * radius, -tall / 2), (top, tall / 2)]
         return [(str(rng.choice(["fabric", "metal"])), lathe(profile))]
-    if kind == 2:
+    if kind == "glass":
         return [("glass", sphere(rng.uniform(1.5, 3.0) * radius, 32))]
-    return [("wall", box([8 * radius, 0.02, 8 * radius], [0, -1.5 * radius, 0]))] if kind == 3 else []
+    if kind == "ledge":
+        return [("wall", box([8 * radius, 0.02, 8 * radius], [0, -1.5 * radius, 0]))]
+    return []
 
 
 def lamps(stage: Stage, count: int) -> list[tuple[Mesh, np.ndarray]]:

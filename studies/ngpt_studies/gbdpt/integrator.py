@@ -39,7 +39,7 @@ import numpy as np
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.film.splats import Splats
-from data_gen.passes import SamplePass
+from data_gen.passes import PACKET, SamplePass
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.features import features
@@ -57,9 +57,6 @@ from ngpt_studies.gbdpt.light_again import Unseen, marked
 from ngpt_studies.gbdpt.light_shift import splat_differences
 from ngpt_studies.gbdpt.pairs import difference, difference_of_one
 from ngpt_studies.gbdpt.roulette import Rater, Worth, survivors, thresholds
-
-# Neighbouring lanes whose rays are traced together, as in ``data_gen.passes``
-_PACKET = 16
 
 
 class GBDPT(BDPT):
@@ -197,7 +194,7 @@ def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np
     The last bits of a ray's result depend on the rays traced with it, and a block must not depend on its pass.
     """
     _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
-    padded = -(-counts // _PACKET) * _PACKET
+    padded = -(-counts // PACKET) * PACKET
     place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
     spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)
     spread[place], exists[place] = lanes, True
